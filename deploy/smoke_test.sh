@@ -1,23 +1,47 @@
 #!/usr/bin/env bash
 # Run the team of compose.yaml on this machine's container engine, and check that it survives:
-#   deploy/smoke_test.sh [AGENTS] [--no-build]
-# It builds the images, starts the team, kills each kind of service once, refines the fused map from outside, waits for the
-# end of all missions, and deletes the team with its volumes. The host needs docker compose and an installed gausslite.
+#   deploy/smoke_test.sh [--tls] [--no-build]
+# It builds the images, starts parser, fusion server and two agents, kills each kind of service once, refines the fused map from outside, waits
+# for the end of all missions, and deletes the team with its volumes. --tls: with compose.tls.yaml and new certificates; a caller without one must be
+# refused. The host needs docker compose and an installed gausslite.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-agents=${1:-2}
-export GAUSSLITE_AGENTS=$agents COMPOSE_PROJECT_NAME=gausslite-smoke GAUSSLITE_FUSION_PORT=${GAUSSLITE_FUSION_PORT:-50152}
+tls='' build=--build certificate=()
+for argument in "$@"; do
+  case $argument in
+    --tls) tls=yes ;;
+    --no-build) build=--no-build ;;
+    *) echo "smoke test: expected --tls or --no-build, got $argument" >&2; exit 2 ;;
+  esac
+done
+export COMPOSE_PROJECT_NAME=gausslite-smoke GAUSSLITE_AGENTS=2 COMPOSE_FILE=compose.yaml${tls:+:deploy/compose.tls.yaml}
+export GAUSSLITE_FUSION_PORT=${GAUSSLITE_FUSION_PORT:-50152} GAUSSLITE_PARSER_PORT=${GAUSSLITE_PARSER_PORT:-50151}
 fusion=127.0.0.1:$GAUSSLITE_FUSION_PORT
 out=$(mktemp -d)
 say() { echo "smoke test: $*"; }
 fail() { say "FAILED: $*"; docker compose logs --no-color --tail 50; exit 1; }
 trap 'say "FAILED in line $LINENO"' ERR
-trap 'docker compose down --volumes --timeout 5 >/dev/null 2>&1; rm -rf "$out"' EXIT
 
+give_certificates() { # USER: the containers' user reads its folders; the host's user deletes them
+  docker run --rm --network none --user 0 --volume "$out/certs:/certs" --entrypoint sh "$(docker compose config --images | grep parser)" \
+    -c "cd /certs && chown -R $1 parser fusion-server agent-1 agent-2"
+}
+clean_up() {
+  docker compose down --volumes --timeout 5 >/dev/null 2>&1
+  [ ! -d "$out/certs" ] || give_certificates "$(id -u)"
+  rm -rf "$out"
+}
+trap clean_up EXIT
+
+team() { gausslite "$@" "${certificate[@]}"; }
+agent_container() { # INDEX: the options of `docker compose port` that name it
+  if [ -n "$tls" ]; then echo "agent-$1"; else echo "--index $1 agent"; fi
+}
 # sed reads to the end: head would end the listing with SIGPIPE, which pipefail reports
 container() { docker compose ps --all --quiet "$1" | sed -n 1p; }
-agent_status() { # SERVICE INDEX: the state in the first line of `gausslite status`
-  gausslite status "$(docker compose port --index "$1" agent 50053)" | sed -n '1s/.*: //p'
+agent_status() { # INDEX: the state in the first line of `gausslite status`
+  # shellcheck disable=SC2046
+  team status "$(docker compose port $(agent_container "$1") 50053)" | sed -n '1s/.*: //p'
 }
 wait_until() { # SECONDS TEXT COMMAND...: repeat the command until it succeeds
   local limit=$1 what=$2 start=$SECONDS
@@ -43,20 +67,30 @@ for pid in (int(name) for name in os.listdir("/proc") if name.isdigit()):
         os.kill(pid, signal.SIGKILL)' || true
   wait_until 180 "$1 is healthy again" healthy_after "$id" $((restarts + 1))
 }
-has_keyframes() { [ "$(gausslite status "$fusion" | sed -n 's/^keyframes *\([0-9]*\).*/\1/p')" -ge 2 ]; }
+has_keyframes() { [ "$(team status "$fusion" | sed -n 's/^keyframes *\([0-9]*\).*/\1/p')" -ge 2 ]; }
 all_ended() {
-  for index in $(seq "$agents"); do [ "$(agent_status "$index")" = ended ] || return 1; done
+  for index in 1 2; do [ "$(agent_status "$index")" = ended ] || return 1; done
 }
 
-[ "${2:-}" = --no-build ] || docker compose build --quiet
-docker compose up --detach --wait || fail "the team did not start"
+[ $build = --no-build ] || docker compose build --quiet
+if [ -n "$tls" ]; then
+  deploy/make_certificates.sh "$out/certs" parser:none fusion-server:none agent-1 agent-2 operator:operator
+  give_certificates 10001
+  operator=$out/certs/operator
+  export GAUSSLITE_CERTS=$out/certs
+  certificate=(--tls-cert "$operator/cert.pem" --tls-key "$operator/key.pem" --tls-ca "$operator/ca.pem")
+fi
+docker compose up --no-build --detach --wait || fail "the team did not start"
+if [ -n "$tls" ]; then
+  ! gausslite status "$fusion" --tls-ca "$out/certs/ca.pem" || fail "a caller without a certificate was answered"
+fi
 wait_until 600 "two keyframes are on the server" has_keyframes
-gausslite refine "$fusion" --iterations 20 --out "$out/during.ply" || fail "refining during the mission"
-for service in agent fusion-server parser; do kill_service "$service"; done
-wait_until 1800 "all $agents missions ended" all_ended
-gausslite status "$fusion"
-gausslite refine "$fusion" --iterations 20 --out "$out/refined.ply" || fail "refining after the mission"
-gausslite fetch "$fusion" --out "$out/fused.ply" || fail "fetching the fused map"
-won=$(gausslite status "$fusion" | grep -c 'wins [1-9]')
-[ "$won" -eq "$agents" ] || fail "expected $agents agents that win voxels, got $won"
+team refine "$fusion" --iterations 20 --out "$out/during.ply" || fail "refining during the mission"
+for service in agent${tls:+-1} fusion-server parser; do kill_service "$service"; done
+wait_until 1800 "both missions ended" all_ended
+team status "$fusion"
+team refine "$fusion" --iterations 20 --out "$out/refined.ply" || fail "refining after the mission"
+team fetch "$fusion" --out "$out/fused.ply" || fail "fetching the fused map"
+won=$(team status "$fusion" | grep -c 'wins [1-9]')
+[ "$won" -eq 2 ] || fail "expected two agents that win voxels, got $won"
 say "passed"

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import gausslite as gl
-from gausslite.perception.colours import ColourMatch, basic_terms, match_colour, no_colours
-from gausslite.perception.surface import mask_colours
+from gausslite.perception.selector import Fit
+from gausslite_selection.colours import basic_terms, mask_colours, match_colour, no_colours
 
 _LABELS = Path(__file__).with_name("home_colours.txt")
 _MIN_PIXELS = 80
@@ -28,8 +28,8 @@ _MIN_PIXELS = 80
 class WordScore:
     """Decisions about the objects that have a colour, and about those that do not."""
 
-    right: dict[ColourMatch, int] = field(default_factory=lambda: dict.fromkeys(ColourMatch, 0))
-    wrong: dict[ColourMatch, int] = field(default_factory=lambda: dict.fromkeys(ColourMatch, 0))
+    right: dict[Fit, int] = field(default_factory=lambda: dict.fromkeys(Fit, 0))
+    wrong: dict[Fit, int] = field(default_factory=lambda: dict.fromkeys(Fit, 0))
 
 
 def read_labels(path: Path = _LABELS) -> dict[tuple[int, str], tuple[set[str], set[str]]]:
@@ -81,7 +81,7 @@ def main() -> None:
     print("| word | objects of it | counted | surely | other objects | left out | surely counted | precision of sure |")
     total = WordScore()
     for term, word_score in scores.items():
-        for match in ColourMatch:
+        for match in Fit:
             total.right[match] += word_score.right[match]
             total.wrong[match] += word_score.wrong[match]
         print(_row(term, word_score))
@@ -90,8 +90,8 @@ def main() -> None:
 
 def _row(word: str, word_score: WordScore) -> str:
     right, wrong = sum(word_score.right.values()), sum(word_score.wrong.values())
-    counted, left_out = right - word_score.right[ColourMatch.NO], word_score.wrong[ColourMatch.NO]
-    sure, wrongly_sure = word_score.right[ColourMatch.YES], word_score.wrong[ColourMatch.YES]
+    counted, left_out = right - word_score.right[Fit.NO], word_score.wrong[Fit.NO]
+    sure, wrongly_sure = word_score.right[Fit.YES], word_score.wrong[Fit.YES]
     precision = f"{sure / (sure + wrongly_sure):.2f}" if sure + wrongly_sure else "-"
     return f"| {word} | {right} | {counted} | {sure} | {wrong} | {left_out} | {wrongly_sure} | {precision} |"
 

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -41,7 +41,7 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.pointing import region_at, region_on_image
+from gausslite.perception.pointing import pointing
 from gausslite.plugins import Group, load
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
@@ -273,6 +273,27 @@ def render_view(
     require_rigid("T_world_camera", pose)
     image = view_map(gaussians, backend, threads).render(camera, pose)
     return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)
+
+
+def region_on_image(
+    frame: Frame,
+    points_px: Sequence[tuple[float, float]] = (),
+    boxes_px: Sequence[tuple[float, float, float, float]] = (),
+) -> Region:
+    """Return the region of points (x, y) and boxes (left, top, right, bottom) on one frame, as one object.
+
+    Raises InvalidInputError for a point outside the image, or a point or box without depth; MissingPluginError.
+    """
+    return pointing().region_on_image(frame, points_px, boxes_px)
+
+
+def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> Region:
+    """Return the region around a point in the world, grown on the frame that shows the point best.
+
+    Of frames that measure the same place, this is the nearest. Raises InvalidInputError if none shows the point;
+    MissingPluginError.
+    """
+    return pointing().region_at(point_m, frames)
 
 
 def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = (0.0, 0.0, 1.0)) -> Answer:

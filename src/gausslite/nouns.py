@@ -1,4 +1,4 @@
-"""Which objects a noun of a task means, and what is known of its kind: sizes, heights and colours as data."""
+"""Which objects a noun of a task means, and what is known of its kind."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def vocabulary() -> NounVocabulary:
 
 @functools.cache
 def words() -> dict[str, Any]:
-    """Return the tables of `words.toml`: nouns, sizes, heights and colours. The file is read once."""
+    """Return the tables of `words.toml`: nouns and sizes. The file is read once."""
     return tomllib.loads(resources.files("gausslite").joinpath("words.toml").read_text(encoding="utf-8"))
 
 

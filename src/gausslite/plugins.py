@@ -27,6 +27,8 @@ class Group(StrEnum):
     CALIBRATORS = "gausslite.calibrators"  # estimates what a recording does not state
     PARSERS = "gausslite.parsers"  # a `ParserBackend`, which reads a sentence as a task graph
     NOUNS = "gausslite.nouns"  # a `NounVocabulary`
+    SELECTORS = "gausslite.selectors"  # a `Selector` class: which objects of a noun a task means
+    POINTING = "gausslite.pointing"  # a `Pointing`: the object at a point, in a box or at a click
     QUESTIONS = "gausslite.questions"  # a function: the objects of a map that a question's task graph means
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
     POLICIES = "gausslite.policies"  # a `MapperSettings` of another system, to compare with; the name is of `--policy`

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from gausslite.domain.errors import UnavailableError
-from gausslite.wire.channel import require_serving
+from gausslite.wire.channel import UNIX, require_serving
 
 FUSION_SERVER = f"{shlex.quote(sys.executable)} -m gausslite_fusion_server"
 _START_LIMIT_S = 300.0
@@ -34,10 +34,10 @@ def resident_mib(process_id: int | None = None) -> float:
 class ServiceProcess:
     """Owns the process of a service with the options of its command, and appends what it logs to a file."""
 
-    def __init__(self, command: str, folder: Path, name: str = "fusion") -> None:
-        """Start the service and wait until it serves. Raises UnavailableError."""
+    def __init__(self, command: str, folder: Path, name: str = "fusion", address: str = "") -> None:
+        """Start the service, by default at a unix socket, and wait until it serves. Raises UnavailableError."""
         self._command = command
-        self.address, self.log = f"unix:{folder}/{name}.sock", folder / f"{name}.log"
+        self.address, self.log = address or f"unix:{folder}/{name}.sock", folder / f"{name}.log"
         self.start()
 
     @property
@@ -104,7 +104,7 @@ class ServiceProcess:
         socket = Path(self.address.removeprefix("unix:"))
         while time.monotonic() - begin_s < _START_LIMIT_S and self.is_running:
             # a call to a socket that does not exist yet would wait for a second before it tries again
-            if socket.exists():
+            if socket.exists() or not self.address.startswith(UNIX):
                 with contextlib.suppress(UnavailableError):
                     require_serving(self.address, None)
                     return time.monotonic() - begin_s

@@ -8,6 +8,7 @@ A lost connection is opened again; errors are in plain words.
 from __future__ import annotations
 
 import itertools
+import logging
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,9 +20,13 @@ import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
 from gausslite.domain.errors import InvalidInputError, StorageError
+from gausslite.fusion.epochs import RECORD as EPOCH
+from gausslite.fusion.migrations import missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import SLOT_BITS, LogChange
 from gausslite_cluster.regions import ALL_SLOTS, OwnedSlots, slots_of
+
+_log = logging.getLogger(__name__)
 
 _FIRST_DELAY_S, _MAX_DELAY_S = 0.1, 5.0
 _PARAMETERS: dict[str, Any] = {
@@ -158,6 +163,7 @@ SELECT %s::smallint, * FROM unnest(%s::bigint[], %s::text[], %s::bigint[], %b::b
 _DELETE = "DELETE FROM gausslite.voxel_updates WHERE slot = %s::smallint AND number = ANY(%s::bigint[])"
 _SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates WHERE"
 _SELECT_ROWS = f"{_SELECT_UPDATES} slot = %s::smallint AND number = ANY(%s::bigint[])"
+_SELECT_EPOCHS = "SELECT agent_id, data, checksum FROM gausslite.records WHERE name = %s"
 _SET_PROPERTY = """
 INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SET value = excluded.value
 """
@@ -231,6 +237,7 @@ class PostgresStore(FusionStore):
 
     def _load(self, db: Database) -> None:
         """Check every row of updates and fill the index; read the id of the content."""
+        self._log.epochs.load(self._intact(EPOCH, db.execute(_SELECT_EPOCHS, (EPOCH,), binary=True)))
         with db.transaction(), db.cursor("load", binary=True) as cursor:
             slots = sorted(ALL_SLOTS if self._owned is None else self._owned.slots)
             cursor.execute(f"{_SELECT_UPDATES} slot = ANY(%s::smallint[]) ORDER BY slot, number", (slots,))
@@ -317,17 +324,23 @@ def begin_opening(db: Database) -> str:
 
 
 def create_or_check(db: Database, name: str) -> None:
-    """Create the tables. Raises StorageError for those of another release."""
+    """Create the tables, or bring those of an earlier schema forward. Raises StorageError for another release's."""
     if db.execute("SELECT to_regclass('gausslite.properties')").fetchone() == (None,):
         db.execute(_SCHEMA)
         db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
         db.execute(_SET_PROPERTY, ("incarnation_id", secrets.token_hex(16)))
-    version = _property(db, "schema_version")
-    if version != str(SCHEMA_VERSION):
-        raise StorageError(
-            f"store {name}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use that "
-            "release, or another database, and the agents send their updates again"
-        )
+    version = int(_property(db, "schema_version") or 0)
+    steps = missing_steps(name, version, SCHEMA_VERSION)
+    if not steps:
+        return
+    # alone: servers that share the database are of that release
+    if db.execute("SELECT pg_try_advisory_xact_lock(%s)", (LOCK,)).fetchone() != (True,):
+        raise StorageError(f"store {name}: of an earlier schema and in use; end all servers, then start this one again")
+    for step in steps:
+        step(lambda query, values: db.execute(_translated(query), values, binary=True))
+    db.execute("ALTER TABLE keyframes ALTER COLUMN data SET STORAGE EXTERNAL")
+    db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
+    _log.warning("store %s: brought forward from schema %d to %d", name, version, SCHEMA_VERSION)
 
 
 def _by_slot(numbers: Iterable[int]) -> Iterator[tuple[int, list[int]]]:

@@ -32,7 +32,7 @@ def slots_of(keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
 
 
 def home_slot(agent_id: str) -> int:
-    """Return the slot of an agent; its earlier map, NAME:earlier, has the same."""
+    """Return the slot of an agent; its former maps, NAME:EPOCH, have the same."""
     return zlib.crc32(agent_id.partition(":")[0].encode()) % SLOTS
 
 

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
-from gausslite.perception.depth_segmenter import DepthSegmenter
-from gausslite.perception.detector import BoxDetector, Detector, SegmentedDetector, Segmenter
+from gausslite.perception.detector import Detector
 from gausslite.perception.detector_file import DetectorOptions
+from gausslite_detectors.boxes import BoxDetector, SegmentedDetector, Segmenter
+from gausslite_detectors.depth_segmenter import DepthSegmenter
 from gausslite_detectors.model_file import OpenModel, open_model, sha256_of
+from gausslite_detectors.tiles import TiledDetector, Tiling
 from gausslite_detectors.yolo_network import MASK_COEFFICIENTS, YoloNetwork, class_names
 
 
@@ -155,7 +157,13 @@ class OnnxReader:
     """The DetectorReader of ONNX files; each file is opened once."""
 
     def open(self, path: Path, options: DetectorOptions) -> Detector:
-        """Return the file's detector with its segmenter. Raises ModelFileError, InvalidInputError, KernelError.
+        """Return the file's detector, also in tiles. Raises ModelFileError, InvalidInputError, KernelError."""
+        tiling = Tiling(options.tiles_per_side, options.time_limit_s)
+        detector = self._open(path, options)
+        return detector if tiling.per_side == 1 else TiledDetector(detector, tiling)
+
+    def _open(self, path: Path, options: DetectorOptions) -> Detector:
+        """Return the file's detector with its segmenter.
 
         segmenter: "yolo", "depth", or the path of a FastSAM file. None selects the detector's own masks if it has them,
         else "depth". vocabulary: the text encoder's, by default next to the detector.

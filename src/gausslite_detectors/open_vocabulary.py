@@ -16,7 +16,7 @@ from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
-from gausslite.perception.detector import BoxSizeLimits
+from gausslite_detectors.boxes import BoxSizeLimits
 from gausslite_detectors.model_file import OpenModel, run_once
 from gausslite_detectors.text_features import PhraseInput, PhraseVectors, Tokenizer, encode_phrase
 from gausslite_detectors.yolo_network import Letterbox, decode, letterbox, suppress

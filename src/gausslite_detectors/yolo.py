@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import DetectedBox, Detection, Rival
 from gausslite.nouns import is_generic, same_kind
-from gausslite.perception.detector import BoxSizeLimits, box_iou
+from gausslite_detectors.boxes import BoxSizeLimits, box_iou
 from gausslite_detectors.class_match import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite_detectors.model_file import OpenModel
 from gausslite_detectors.yolo_network import Candidates, YoloNetwork, suppress

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,13 +22,13 @@ from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectReport, OrientedBox, TeamObject, oriented_box
+from gausslite.domain.objects import Answer, ObjectReport, OrientedBox, TeamObject, oriented_box
 from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
 from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
+from gausslite.plugins import Group, load
 from gausslite.wire.security import TlsFiles
-from gausslite_language.questions import answer
 from gausslite_language.rules import RuleParser
 
 _NS_PER_S = 1e9
@@ -98,6 +98,7 @@ def _select(place: _Place, question: str) -> tuple[Sequence[TeamObject], Sequenc
     except TaskError as error:
         raise InvalidInputError(f"QUESTION: {error}") from error
     by_id = {team_object.landmark.object_id: team_object for team_object in place.objects}
+    answer: Callable[..., Answer] = load(Group.QUESTIONS, purpose="questions")
     found = answer(graph, [team_object.landmark for team_object in place.objects], place.up_axis, place.T_world_camera)
     return [by_id[landmark.object_id] for landmark in found.objects], found.notes
 

@@ -45,6 +45,7 @@ def _run(options: argparse.Namespace) -> int:
         case _:
             report = verify(options.store, options.repair)
             done = " deleted; agents will send what is missing" if options.repair and report.damaged_rows else ""
+            done += f"; rows on damaged pages are gone, the file before is {report.replaced}" if report.replaced else ""
             text = f"{options.store}: {_summary(report)}, {report.damaged_rows} damaged rows{done}"
             _print(options, text, dataclasses.asdict(report))
             return int(report.damaged_rows > 0 and not options.repair)
@@ -68,5 +69,5 @@ def _parser() -> CommandParser:
             command.add_argument(path, type=Path, metavar=path.upper())
         command.add_argument("--json", action="store_true", help="print one JSON object")
         if name == "verify":
-            command.add_argument("--repair", action="store_true", help="delete the damaged rows; without a server")
+            command.add_argument("--repair", action="store_true", help="keep only what is intact; without a server")
     return parser

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
@@ -14,17 +14,17 @@ from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.alignment import FrameDecisions, TeamView
-from gausslite.fusion.earlier_map import earlier_map_of
+from gausslite.fusion.epochs import agent_of
 from gausslite.fusion.frames import FrameAlignment, FrameFit
 from gausslite_places.fit_process import FitProcess
 from gausslite_places.frame_fit import MIN_SAMPLES, Fit, SurfaceSamples, fit_frame
 from gausslite_places.frame_rules import (
-    WITNESSES,
     Comparison,
+    Majority,
+    agree_as_declared,
     contradicts,
     corrected,
     corrects,
-    find_quarantined,
     in_state,
 )
 from gausslite_places.map_samples import MapSamples
@@ -52,12 +52,14 @@ class _AgentMap:
     """What is known of one agent's map, and the voxels that have to be read again.
 
     frame_id: of the frame that `changed` and the comparisons are for, 0 before the first poll. compared: number of the
-    latest comparison, 0 before the first. first_seq: of the updates since the last correction.
+    latest comparison, 0 before the first. first_seq: of the updates since the last correction. is_new: some have come
+    since the latest comparison.
     """
 
     frame_id: int = 0
     unread: set[int] = field(default_factory=set)
     changed: int = 0
+    is_new: bool = False
     compared: int = 0
     first_seq: int = 0
     samples: MapSamples = field(default_factory=MapSamples)
@@ -111,7 +113,7 @@ class MapAligner:
         self._take_news(team)
         for name, alignment in self._unknown_frames.search(team, frames).items():
             if alignment.is_localised:
-                self._change_frame(name)
+                self._change_frame(name, alignment)
             if alignment.is_localised or alignment.message != frames[name].message:
                 frames.decide(name, alignment)
         due = self._due(team, frames)[:at_most]
@@ -140,35 +142,35 @@ class MapAligner:
                     self._add(agent_id, team)
                 self._maps[agent_id].unread |= own.keys
                 self._maps[agent_id].changed += own.changed
-        for agent_id, (frame_id, _) in team.frames.items():
+                self._maps[agent_id].is_new = True
+        for agent_id, (frame_id, alignment) in team.frames.items():
             known = self._maps.get(agent_id)
             if known is not None and known.frame_id != frame_id:
                 if known.frame_id:
-                    self._change_frame(agent_id)
+                    self._change_frame(agent_id, alignment)
                 known.frame_id = frame_id
 
     def _add(self, agent_id: str, team: TeamView) -> None:
-        """Add an agent's map: empty, or after a restart; who was quarantined stays so until it is tested again."""
+        """Add an agent's map: empty, or after a restart."""
         own = self._maps[agent_id] = _AgentMap()
-        alignment = team.frames[agent_id][1] if agent_id in team.frames else None
-        if alignment is None:
-            return
-        if alignment.segments:
+        if agent_id in team.frames and team.frames[agent_id][1].segments:
             own.first_seq = team.totals(agent_id).highest_update_seq + 1
-        if alignment.fit is not None and not alignment.is_used:
-            for other in team.frames.keys() & set(alignment.against):
-                self._comparisons[frozenset((agent_id, other))] = Comparison(alignment.fit, {agent_id: WITNESSES})
 
     def _delete(self, agent_id: str) -> None:
         self._maps.pop(agent_id, None)
         self._drop_comparisons(agent_id)
 
-    def _change_frame(self, agent_id: str) -> None:
+    def _change_frame(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Drop what was found in an agent's former frame."""
         self._drop_comparisons(agent_id)
+        self._compare_again(agent_id, alignment)
+
+    def _compare_again(self, agent_id: str, alignment: FrameAlignment) -> None:
+        """Compare the updates of an agent again from its latest segment on."""
         own = self._maps.get(agent_id)
         if own is not None:
-            own.first_seq, own.changed = 0, max(own.changed, len(own.samples))
+            own.first_seq = alignment.segments[-1].first_seq if alignment.segments else 0
+            own.changed = max(own.changed, len(own.samples))
 
     def _drop_comparisons(self, agent_id: str) -> None:
         self._comparisons = {pair: found for pair, found in self._comparisons.items() if agent_id not in pair}
@@ -200,17 +202,18 @@ class MapAligner:
             if len(source) < MIN_SAMPLES:
                 return
             witnesses = list(self._witnesses(agent_id, source, team, frames))
-            fits = [self._fit(source, samples) for _, samples in witnesses]
-            joint = self._joint_fit(source, alignment, list(zip(witnesses, fits, strict=True)), frames)
+            for name, samples in witnesses:
+                self._note(agent_id, name, self._fit(source, samples), source, frames)
+            leaders = self._leaders(agent_id, [name for name, _ in witnesses], frames)
+            joint = self._joint_fit(agent_id, source, {name: dict(witnesses)[name] for name in leaders})
         except (UnavailableError, StorageError):
             own.changed += changed
             raise
-        for (name, _), fit in zip(witnesses, fits, strict=True):
-            self._note(agent_id, name, fit, frames)
-        first_seq, own.first_seq = own.first_seq, highest_seq + 1
+        first_seq, own.first_seq, own.is_new = own.first_seq, highest_seq + 1, False
         if joint is not None:
-            kept = replace(alignment, fit=joint, against=())
-            frames.decide(agent_id, corrected(alignment, joint, first_seq) if corrects(joint) else kept)
+            if corrects(joint):
+                alignment = corrected(alignment, joint, first_seq, leaders)
+            frames.decide(agent_id, replace(alignment, fit=joint))
 
     def _read(self, agent_id: str, team: TeamView) -> None:
         """Read the voxels that changed since the last time, as far as they are sampled."""
@@ -234,48 +237,56 @@ class MapAligner:
         for _, _, name, samples in sorted(found, key=lambda candidate: candidate[:3])[:_MAX_WITNESSES]:
             yield name, samples
 
-    def _joint_fit(
-        self,
-        source: SurfaceSamples,
-        alignment: FrameAlignment,
-        fits: Sequence[tuple[_Witness, FrameFit | None]],
-        frames: _Frames,
-    ) -> FrameFit | None:
-        """Return the fit to all earlier witnesses together that are used and that the agent does not contradict."""
-        earlier = [
-            (samples, fit)
-            for (name, samples), fit in fits
-            if frames[name].is_used
-            and frames[name].rank < alignment.rank
-            and not (fit is not None and contradicts(fit))
-        ]
-        if len(earlier) == 1:
-            return earlier[0][1]
-        return self._fit(source, SurfaceSamples.concatenate([samples for samples, _ in earlier])) if earlier else None
+    def _leaders(self, agent_id: str, witnesses: Sequence[str], frames: _Frames) -> tuple[str, ...]:
+        """Return the witnesses to whose frame the agent is corrected: used, not contradicted, and leading it."""
+        majority = self._majority(frames)
+        comparisons = {name: self._comparisons.get(frozenset((agent_id, name))) for name in witnesses}
+        return tuple(
+            name
+            for name, found in comparisons.items()
+            if frames[name].is_used and majority.leads(name, agent_id) and not (found and contradicts(found.fit))
+        )
 
-    def _note(self, agent_id: str, name: str, fit: FrameFit | None, frames: _Frames) -> None:
-        pair = frozenset((agent_id, name))
+    def _majority(self, frames: _Frames) -> Majority:
+        return Majority(
+            [name for name in frames if name in self._maps and frames[name].is_localised], self._comparisons
+        )
+
+    def _joint_fit(
+        self, agent_id: str, source: SurfaceSamples, leaders: Mapping[str, SurfaceSamples]
+    ) -> FrameFit | None:
+        """Return the fit to all leaders together."""
+        if len(leaders) == 1:
+            found = self._comparisons.get(frozenset((agent_id, *leaders)))
+            return None if found is None else found.fit
+        return self._fit(source, SurfaceSamples.concatenate([*leaders.values()])) if leaders else None
+
+    def _note(self, agent_id: str, name: str, fit: FrameFit | None, source: SurfaceSamples, frames: _Frames) -> None:
         if fit is None:
             # too little in common says nothing, also of what was found before
             return
-        before = self._comparisons.get(pair)
-        parts: dict[str, int] = {}
-        if contradicts(fit):
-            parts = dict(before.contradicting) if before is not None else {}
-            # new data of either side count against a frame that the server has found
-            for member in {agent_id, *(member for member in pair if frames[member].is_unknown)}:
-                parts[member] = parts.get(member, 0) + 1
-        self._comparisons[pair] = Comparison(fit, parts)
+        pair, is_new = frozenset((agent_id, name)), self._maps[agent_id].is_new
+        before = self._comparisons.get(pair, Comparison(fit, 0))
+        agrees = agree_as_declared(fit, frames[agent_id], frames[name], source.points_m.mean(axis=0), before.agrees)
+        now = self._comparisons[pair] = Comparison(fit, self._compared, agrees)
+        # new data of either side count against a frame that the server has found
+        members = {agent_id, *(member for member in pair if frames[member].is_unknown)}
+        if contradicts(fit) and not agrees:
+            now.contradicting = _counted(before.contradicting, members, is_new)
+        elif fit.is_sure and not corrects(fit):
+            now.agreeing = _counted(before.agreeing, {agent_id}, is_new)
 
     def _decide(self, frames: _Frames) -> list[str]:
         """Decide the state of each agent from the comparisons; returns the earlier maps to delete."""
         deleted: list[str] = []
         while True:
             self._is_undecided = False
-            names = [name for name in frames if name in self._maps and frames[name].is_localised]
-            quarantined = find_quarantined({name: i for i, name in enumerate(names)}, self._comparisons)
+            majority = self._majority(frames)
+            quarantined = majority.quarantined({name: own.against for name, own in frames.items() if not own.is_used})
             outdated = [
-                earlier_map_of(name) for name, against in quarantined.items() if set(against) == {earlier_map_of(name)}
+                min(against)
+                for name, against in quarantined.items()
+                if {agent_of(other) for other in against} == {name}
             ]
             if not outdated:
                 break
@@ -283,25 +294,56 @@ class MapAligner:
             deleted.append(outdated[0])
             self._delete(outdated[0])
             frames.decided.discard(outdated[0])
+        self._follow(majority, frames)
         has_reference = False
-        for name in names:
+        for name in majority.supporters:
             before = frames[name]
-            after = in_state(before, self._contradictions(name, quarantined), name in quarantined, not has_reference)
-            has_reference |= after.is_used
+            against = self._contradictions(name, majority, quarantined)
+            if name in quarantined and not against:
+                # what it contradicted when it was compared
+                continue
+            is_first = not has_reference and not before.segments
+            is_even = any(majority.is_even(name, other) for other in against)
+            after = in_state(before, against, name in quarantined, is_first, is_even)
+            has_reference |= after.is_used and not after.segments
             if (after.state, after.message, after.against) != (before.state, before.message, before.against):
                 frames.decide(name, after)
                 if not after.is_localised:
                     self._drop_comparisons(name)
         return deleted
 
-    def _contradictions(self, agent_id: str, quarantined: Collection[str]) -> dict[str, FrameFit]:
-        """Return the fits of the used agents that this one contradicts."""
+    def _follow(self, majority: Majority, frames: _Frames) -> None:
+        """Take back corrections to agents that lead no more, and compare those that a leader has found to differ."""
+        for name in majority.supporters:
+            before = own = frames[name]
+            for witness in {witness for segment in own.segments for witness in segment.witnesses}:
+                if witness in majority.supporters and not majority.leads(witness, name):
+                    own = own.without(witness, is_gone=False)
+            if own is not before:
+                frames.decide(name, own)
+                self._compare_again(name, own)
+        for pair, found in self._comparisons.items():
+            for name in pair & majority.supporters.keys() if corrects(found.fit) else ():
+                is_led = all(other in majority.supporters and majority.leads(other, name) for other in pair - {name})
+                if is_led and self._maps[name].compared < found.number:
+                    self._compare_again(name, frames[name])
+
+    def _contradictions(self, agent_id: str, majority: Majority, quarantined: Collection[str]) -> dict[str, FrameFit]:
+        """Return the fits of the used agents that this one contradicts, or differs from while neither leads."""
         return {
             name: comparison.fit
             for pair, comparison in self._comparisons.items()
             for name in pair - {agent_id}
-            if agent_id in pair and comparison.contradicting and name not in quarantined
+            if agent_id in pair
+            and name not in quarantined
+            and name in majority.supporters
+            and (comparison.contradicting or (corrects(comparison.fit) and majority.is_even(agent_id, name)))
         }
+
+
+def _counted(before: Mapping[str, int], members: Collection[str], is_new: bool) -> dict[str, int]:
+    """Return how many parts of each agent's data say so; is_new: the members' data were not counted before."""
+    return {**before, **{member: max(before.get(member, 0) + is_new, 1) for member in members}}
 
 
 def open_aligner(grid: VoxelGrid) -> MapAligner:

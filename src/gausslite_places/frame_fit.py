@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from gausslite.domain.pose import rotation_angle_deg, transform_points
+from gausslite.domain.pose import rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows
 from gausslite.fusion.frames import FrameFit, Misfit
 from gausslite_places.surface_registration import Surface
@@ -35,6 +35,7 @@ _MIN_BLOCKS = 8
 _MIN_MATCHED = 0.4
 _SIGMAS = 4.0
 """Of 650 pairs of maps in the same frame, none has a motion with such gains of both residuals."""
+_PROBE_M, _PROBE_DEG = 0.15, 8.0
 _APART = 0.65
 """Mean distance as a share of its saturation; the largest of 650 pairs of maps in the same frame is 0.55."""
 
@@ -162,6 +163,11 @@ def evaluate_motion(
         _lower_bound(old - new, blocks) > 0 for old, new in zip(before[:2], after[:2], strict=True)
     )
     is_apart = bool(before[0].mean() > _APART)
+    kept, placed = (after, motion) if is_better else (before, np.eye(4))
+    is_sure = kept[2].mean() >= _MIN_MATCHED and all(
+        _lower_bound(np.add(*target.residuals(held_out.moved(probe @ placed))[:2]) - np.add(*kept[:2]), blocks) > 0
+        for probe in _probes(transform_points(placed, centre_m[None])[0])
+    )
     misfit_before, misfit_after = (
         Misfit(_MAX_DISTANCE_M * float(distance.mean()), _MAX_COLOUR * float(colour.mean()))
         for distance, colour, _ in (before, after)
@@ -175,7 +181,16 @@ def evaluate_motion(
         compared=len(held_out),
         is_better=bool(is_better),
         is_apart=is_apart,
+        is_sure=bool(is_sure),
     )
+
+
+def _probes(centre_m: Float64[ndarray, "3"]) -> Iterator[Float64[ndarray, "4 4"]]:
+    """Yield shifts along each axis, and turns about it."""
+    for twist in np.vstack([np.eye(6), -np.eye(6)]) * ([_PROBE_M] * 3 + [np.radians(_PROBE_DEG)] * 3):
+        T = transform_of(twist)
+        T[:3, 3] += centre_m - T[:3, :3] @ centre_m
+        yield T
 
 
 def _lower_bound(values: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]) -> float:

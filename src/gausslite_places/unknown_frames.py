@@ -304,8 +304,8 @@ class UnknownFrames:
     ) -> FrameAlignment:
         try:
             source = self._samples(team, agent_id, unknown)
-            target = SurfaceSamples.concatenate([self._samples(team, *own) for own in localised.items()])
-            found = self._find(source, target)
+            targets = {name: self._samples(team, name, own) for name, own in localised.items()}
+            found = self._find(source, SurfaceSamples.concatenate([*targets.values()]))
             self._failed.pop(agent_id, None)
         except (UnavailableError, CodecError, InvalidInputError, StorageError) as error:
             # one agent's data must not end the comparisons of the others, nor be searched for ever
@@ -313,7 +313,11 @@ class UnknownFrames:
             self._failed[agent_id] = self._failed.get(agent_id, 0) + 1
             if self._failed[agent_id] < _ATTEMPTS:
                 del self._searched[agent_id]
-        return unknown.unlocalised(found.reason) if found.fit is None else placed(unknown, found.fit)
+        if found.fit is None:
+            return unknown.unlocalised(found.reason)
+        moved_m = source.moved(found.fit.motion).points_m
+        seen = (name for name, target in targets.items() if in_shared_cubes(moved_m, target.points_m).any())
+        return placed(unknown, found.fit, tuple(seen))
 
     def _samples(self, team: TeamView, agent_id: str, alignment: FrameAlignment) -> SurfaceSamples:
         """Return samples of the agent's voxels and keyframes, in the fused frame if the agent is localised."""

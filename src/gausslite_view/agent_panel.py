@@ -14,6 +14,7 @@ from gausslite.wire.convert_task import object_from_message
 from gausslite.wire.map_follower import MapFollower
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
+from gausslite_view.decoding import camera_view_from_message
 from gausslite_view.map_page import MapPage, TaskField, text_html
 from gausslite_view.plots import HistoryPlot, QualityPlot
 from gausslite_view.pointing import PointingPanel
@@ -59,7 +60,7 @@ class AgentPanel:
             targets=tuple(status.graph.targets),
             objects=objects,
         )
-        view = self._client.camera_view()
+        view = camera_view_from_message(self._client.camera_view())
         self._pointing.show(view, objects)
         if view is not None:
             self._camera.show(view, contents)

@@ -20,8 +20,8 @@ from gausslite.domain.relevance import CameraView, DetectedImage
 from gausslite.domain.state import EvenHistory
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import KEYFRAME_JPEG_QUALITY, decode_colour, encode_colour
-from gausslite.wire.views import StoredKeyframe
 from gausslite_view.contents import AgentPath, ViewContents, object_boxes
+from gausslite_view.decoding import StoredKeyframe, stored_keyframe_from_message
 from gausslite_view.map_page import MapPage
 
 _REGION_RGB, _BOX_RGB = (255, 60, 60), (60, 230, 90)
@@ -224,7 +224,7 @@ class TeamCameras:
         for agent_id in sorted(newest)[:MAX_IMAGES]:
             indices = newest[agent_id].indices
             back = min(self.keyframes_back, len(indices) - 1)
-            chosen = self._client.keyframe(agent_id, indices[-1 - back]) if back else None
+            chosen = stored_keyframe_from_message(self._client.keyframe(agent_id, indices[-1 - back])) if back else None
             self._chosen[agent_id] = chosen or newest[agent_id]
         most = max((len(stored.indices) for stored in newest.values()), default=0)
         self._folder.visible = most > 0
@@ -276,7 +276,7 @@ class TeamKeyframes:
         self._names = tuple(sorted(agent_status.agent_id for agent_status in agents))
         known = {}
         for agent in agents:
-            newest = self._client.keyframe(agent.agent_id) if agent.keyframes else None
+            newest = stored_keyframe_from_message(self._client.keyframe(agent.agent_id)) if agent.keyframes else None
             if newest is None:
                 continue
             # the poses are those in the fused frame, which an alignment moves
@@ -315,7 +315,7 @@ class TeamKeyframes:
             for index in self._missing(known)[:left]:
                 left -= 1
                 try:
-                    keyframe = self._client.keyframe(name, index)
+                    keyframe = stored_keyframe_from_message(self._client.keyframe(name, index))
                 except InvalidInputError:  # the agent has replaced it meanwhile
                     keyframe = None
                 known.views[index] = None if keyframe is None else _view(keyframe)

@@ -13,9 +13,9 @@ from numpy import ndarray
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import FusionClient
-from gausslite.wire.views import StoredKeyframe
 from gausslite_evaluation.metrics import psnr
 from gausslite_view.contents import category_colour
+from gausslite_view.decoding import StoredKeyframe
 
 _MAX_POINTS = 600
 _STROKES = ("#2563eb", "#dc2626", "#16a34a", "#d97706", "#7c3aed", "#0891b2")

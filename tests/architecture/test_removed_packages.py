@@ -23,7 +23,6 @@ WORKING = (
     ("gausslite", "--help"),
     ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--roi", "../regions.npz", "--out", "roi"),
     ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--poses", "track", "--out", "uniform"),
-    ("gausslite", "fuse", "roi/map.ply", "uniform/map.ply", "--out", "fused.ply"),
     ("gausslite_fusion_server", "--store", "fusion.sqlite"),
     ("gausslite_agent",),
 )
@@ -33,6 +32,7 @@ _MAP = ("gausslite", "map", SEQUENCE, *_TASK)
 COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_language": (("gausslite", "parse", "Find the cup"), _MAP, ("gausslite_parser",)),
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
+    "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
     "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
@@ -42,6 +42,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_recorders": (),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),
+        ("gausslite", "fuse", "a.ply", "b.ply", "--out", "fused.ply"),
         ("gausslite_fusion_server", "verify", "fusion.sqlite"),
         ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
     ),

@@ -18,11 +18,20 @@ from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.nouns import same_kind
+from gausslite_bench.quality.growth import curves, growth_plot, growth_table
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HOME_TASKS, TaskKind, choose_home_tasks
 from gausslite_bench.quality.real_scenes import RealScenePlan
 from gausslite_bench.quality.study import FinishedTrial, Study, run_study
-from gausslite_bench.quality.tables import FULL_PSNR, ROI_PSNR, StudyResults, ablation_table, quality_table
+from gausslite_bench.quality.tables import (
+    FULL_FITTED,
+    FULL_PSNR,
+    ROI_FITTED,
+    ROI_PSNR,
+    StudyResults,
+    ablation_table,
+    quality_table,
+)
 from gausslite_bench.quality.trial_cache import TrialCache
 from gausslite_bench.quality.trials import (
     BudgetMode,
@@ -167,6 +176,19 @@ def test_the_ablation_table_has_one_row_per_component_and_both_budgets() -> None
     one = "25.00 | 20.00 | 26.00 | 20.00"
     assert f"| +GFD | {one} | {one} |" in table
     assert "ROI PSNR↑, fitted, equal time" in table
+
+
+def test_a_curve_that_falls_is_named() -> None:
+    steps = {
+        str(iterations): StudyResults([finished(TASK, 0, psnr_db, TrialBudget(iterations=iterations))])
+        for iterations, psnr_db in ((8, 26.0), (32, 26.5), (128, 25.9))
+    }
+    found = curves(steps)
+    assert [(curve.metric, curve.falls) for curve in found] == [(ROI_FITTED.title, True), (FULL_FITTED.title, False)]
+    table = growth_table("iterations", list(steps), found)
+    assert "| 27.00 | 27.50 | 26.90 | **0.60** |" in table
+    assert "1 of 2 curves fall by more than 0.1 dB in a step." in table
+    assert growth_plot(list(steps), found).count("<polyline") == len(found)
 
 
 @pytest.mark.slow

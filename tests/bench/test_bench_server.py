@@ -29,13 +29,14 @@ def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.
 
 @pytest.mark.slow
 def test_good_agents_are_measured_beside_an_attack(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ("bench", "server", "--held", "0", "--seconds", "1", "--hostile", "tombstones,half-open")
+    messages = {"busy": 16, "tombstones": 16, "half-open": 16, "parser": 4}
+    arguments = ("bench", "server", "--held", "0", "--seconds", "1", "--hostile", ",".join(messages))
     assert main([*arguments, "--json"]) == 0
     results = json.loads(capsys.readouterr().out)["attacks"]
-    assert [result["attack"] for result in results] == ["tombstones", "half-open"]
+    assert [result["attack"] for result in results] == list(messages)
     for result in results:
-        assert [load["messages"] for load in (result["quiet"], result["attacked"])] == [16, 16]
-        assert result["quiet"]["missing"] == result["attacked"]["missing"] == 0
+        for load in (result["quiet"], result["attacked"]):
+            assert (load["messages"], load["missing"]) == (messages[result["attack"]], 0)
         assert result["rss_mib"] > 0
 
 

@@ -204,7 +204,7 @@ def test_another_schema_and_missing_rights_are_one_clear_error(postgres: Postgre
     url = postgres.new_database()
     PostgresStore(url).close()
     execute(url, "UPDATE gausslite.properties SET value = '77' WHERE name = 'schema_version'")
-    assert f"expected schema version {SCHEMA_VERSION}, got 77" in one_line(lambda: PostgresStore(url))
+    assert f"to {SCHEMA_VERSION}, got 77" in one_line(lambda: PostgresStore(url))
     guest = postgres.new_database().replace("postgres:", "guest:", 1)
     execute(guest.replace("guest:", "postgres:", 1), "DROP ROLE IF EXISTS guest", "CREATE ROLE guest LOGIN")
     assert "permission denied" in one_line(lambda: PostgresStore(guest))

@@ -12,7 +12,7 @@ from tool_modules import load_tool
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.perception.detector import BoxSizeLimits
+from gausslite_detectors.boxes import BoxSizeLimits
 from gausslite_detectors.model_file import open_model
 from gausslite_detectors.open_vocabulary import INPUTS, GroundingDino, GroundingSettings, preprocess
 from gausslite_detectors.text_features import encode_phrase, open_phrase_vectors

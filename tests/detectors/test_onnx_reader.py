@@ -14,10 +14,12 @@ from gausslite.domain.errors import InvalidInputError, KernelError, ModelFileErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
-from gausslite.perception.detector import Detector, SegmentedDetector
+from gausslite.perception.detector import Detector
 from gausslite.perception.detector_file import DetectorOptions
+from gausslite_detectors.boxes import SegmentedDetector
 from gausslite_detectors.model_file import choose_providers, open_model
 from gausslite_detectors.models import READER, ModelFamily, identify_family
+from gausslite_detectors.tiles import TiledDetector
 
 # in the network's pixels; in the image columns 32 to 64, rows 16 to 48
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
@@ -68,6 +70,12 @@ def test_boxes_with_class_names_get_masks_from_depth(tmp_path):
         opened(path, "yolo")
     with pytest.raises(InvalidInputError, match=r"expected depth or a FastSAM file, got .*world\.onnx"):
         opened(path, str(path))
+
+
+def test_a_detector_is_tiled_on_request(tmp_path):
+    options = DetectorOptions(threads=1, tiles_per_side=3, time_limit_s=2.0)
+    assert isinstance(READER.open(yolo(tmp_path), options), TiledDetector)
+    assert not isinstance(opened(yolo(tmp_path)), TiledDetector)
 
 
 @pytest.mark.parametrize("name", [None, "yolo"])

@@ -13,9 +13,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
-from gausslite.perception.detector import BoxSizeLimits
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
+from gausslite_detectors.boxes import BoxSizeLimits
 from gausslite_detectors.model_file import open_model
 from gausslite_detectors.yolo import (
     ClassAgnosticSegmenter,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -60,13 +61,11 @@ def test_a_damaged_row_is_refused_with_the_way_out_and_repair_removes_only_it(pa
     store.close()
 
 
-@pytest.mark.parametrize(("table", "read"), [("keyframes", "keyframe"), ("records", "records")])
-def test_a_damaged_keyframe_or_record_is_not_served(path: Path, table: str, read: str) -> None:
+@pytest.mark.parametrize("table", ["keyframes", "records"])
+def test_a_damaged_keyframe_or_record_is_not_served(path: Path, table: str) -> None:
     flip_a_bit(path, table, "data")
-    store = SqliteStore(path)
-    with pytest.raises(StorageError, match="is damaged"):
-        store.keyframe("ant", 1) if read == "keyframe" else store.records("objects")
-    store.close()
+    with pytest.raises(StorageError, match="is damaged"), closing(SqliteStore(path)) as store:
+        store.keyframe("ant", 1)
     assert verify(path, repair=True).damaged_rows == 1
     assert verify(path).damaged_rows == 0
 
@@ -96,6 +95,64 @@ def test_a_keyframe_with_parts_that_are_missing_or_not_its_own_is_not_served(pat
     assert (report.damaged_rows, report.keyframes) == (0, 0)
 
 
+def test_repair_keeps_the_rows_of_intact_pages_and_the_file_before(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    with closing(SqliteStore(path)) as store:
+        for number in range(60):
+            store.put(random_subset("ant", 1 + number, {100 * number: 3}))
+    data = bytearray(path.read_bytes())
+    with closing(sqlite3.connect(path)) as db:
+        query = "SELECT rootpage FROM sqlite_master WHERE name = 'voxel_updates'"
+        [[root]] = db.execute(query)
+    # the third leaf of the table
+    leaf = int.from_bytes(data[4096 * (root - 1) + 12 + 2 * 2 :][:2], "big")
+    page = int.from_bytes(data[4096 * (root - 1) + leaf :][:4], "big")
+    data[4096 * (page - 1) : 4096 * page] = bytes(4096)
+    path.write_bytes(data)
+    for read in (SqliteStore, verify):
+        with pytest.raises(StorageError, match=r"--repair"):
+            read(path)
+    report = verify(path, repair=True)
+    assert (tmp_path / "store.sqlite.replaced-1").read_bytes() == bytes(data)
+    assert report.replaced.endswith("store.sqlite.replaced-1")
+    with closing(SqliteStore(path)) as store:
+        kept = store.batch("ant").keys.tolist()
+    assert 40 < len(kept) < 60
+    assert {0, 5900} < set(kept)
+
+
+@pytest.mark.parametrize("change", ["DELETE FROM properties", "UPDATE properties SET value = 'x'"])
+def test_a_store_without_its_properties_is_one_clear_line(path: Path, change: str) -> None:
+    with sqlite3.connect(path) as db:
+        db.execute(change)
+    db.close()
+    for read in (SqliteStore, verify):
+        with pytest.raises(StorageError, match="expected its properties, got damaged ones; restore a backup"):
+            read(path)
+    verify(path, repair=True)
+    with closing(SqliteStore(path)) as store:
+        assert store.batch("ant").keys.tolist() == list(VOXELS)
+
+
+def test_a_store_in_a_read_only_place_is_verified_and_backed_up_with_its_log(tmp_path: Path) -> None:
+    path, place = tmp_path / "store.sqlite", tmp_path / "read-only"
+    place.mkdir()
+    with closing(SqliteStore(path)) as store:
+        store.put(random_subset("ant", 1, {11: 2}))
+        for each in tmp_path.glob("store.sqlite*"):
+            shutil.copy(each, place / each.name)
+    (place / "store.sqlite-shm").unlink()
+    before = sorted(each.name for each in place.iterdir())
+    for each in (*place.iterdir(), place):
+        each.chmod(each.stat().st_mode & ~0o222)
+    # root may write everywhere
+    with patch("os.access", side_effect=lambda own, _: own == tmp_path):
+        assert verify(place / path.name).voxels == 1
+        assert back_up(place / path.name, tmp_path / "backup").voxels == 1
+    assert sorted(each.name for each in place.iterdir()) == before
+    place.chmod(0o700)
+
+
 @pytest.mark.parametrize("is_database", [False, True])
 def test_an_emptied_file_is_refused(path: Path, is_database: bool) -> None:
     path.write_bytes(b"")
@@ -107,12 +164,13 @@ def test_an_emptied_file_is_refused(path: Path, is_database: bool) -> None:
         SqliteStore(path)
 
 
-def test_a_torn_log_is_cut_at_the_last_whole_message(tmp_path: Path) -> None:
+def test_a_torn_log_is_told_and_cut_at_the_last_whole_message_when_it_is_repaired(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     store = SqliteStore(path)
     for update_seq in range(1, 6):
         store.put(random_subset("ant", update_seq, {update_seq: 30}))
     files = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+    incarnation_id = store.incarnation_id
     store.close()
     for cut in (1, 3000, 9000):
         folder = tmp_path / str(cut)
@@ -120,7 +178,12 @@ def test_a_torn_log_is_cut_at_the_last_whole_message(tmp_path: Path) -> None:
         for name, data in files.items():
             (folder / name).write_bytes(data[:-cut] if name.endswith("-wal") else data)
         (folder / "store.sqlite-shm").unlink()
+        for read in (SqliteStore, verify, lambda path, own=folder: back_up(path, own / "copy")):
+            with pytest.raises(StorageError, match=r"expected commit 6 of .*, got commit \d of .*--repair"):
+                read(folder / "store.sqlite")
+        verify(folder / "store.sqlite", repair=True)
         torn = SqliteStore(folder / "store.sqlite")
+        assert torn.incarnation_id != incarnation_id
         highest = torn.totals("ant").highest_update_seq
         # the agents compare this number with what was acknowledged, and send again what is missing
         assert highest < 5

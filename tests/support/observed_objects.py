@@ -9,12 +9,11 @@ import numpy as np
 from gausslite.domain.objects import ObjectRole
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph
-from gausslite.perception.colours import ColourFilter
 from gausslite.perception.evidence import Evidence, LandmarkState
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
-from gausslite.perception.relations import NamedObjects, RelationFilter
+from gausslite.perception.relations import NamedObjects
+from gausslite.perception.selector import open_selector
 from gausslite.perception.settings import RelevanceTrackerSettings
-from gausslite.perception.supporting_surface import SupportingSurfaces
 from gausslite.perception.targets import TargetSelector
 
 
@@ -23,13 +22,10 @@ class ObservedObjects:
 
     def __init__(self, graph: TaskGraph) -> None:
         settings = RelevanceTrackerSettings()
-        up = np.array(unit_up_axis(settings.up_axis))
-        surfaces = SupportingSurfaces(graph, frozenset(), up)
         self._evidence = Evidence(settings.evidence)
         self._object_map = ObjectMap()
-        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph))
-        relations = RelationFilter(graph, up, objects, surfaces)
-        self._targets = TargetSelector(graph, objects, relations, surfaces)
+        selector = open_selector(graph, (), np.array(unit_up_axis(settings.up_axis)))
+        self._targets = TargetSelector(graph, NamedObjects(self._object_map, self._evidence, selector))
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
-from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
+from gausslite.domain.errors import InvalidInputError, MismatchError, RateLimitError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
@@ -60,6 +60,7 @@ class QueuedFrame:
 _Result = TypeVar("_Result")
 _Arguments = ParamSpec("_Arguments")
 _log = logging.getLogger(__name__)
+_IDLE_WAIT_S = 10.0
 LOCALISING = "the agent localises itself in the map of --prior"
 
 
@@ -204,6 +205,22 @@ class MappingWorker:
     def run(self, function: Callable[[GaussianMapper], _Result]) -> Future[_Result]:
         """Run a function of the mapper on the worker, between two frames."""
         return self._submit(lambda: function(self._mapper))
+
+    def run_when_idle(self, function: Callable[[GaussianMapper], _Result]) -> _Result:
+        """Return what a function of the mapper returns, run on the worker when no frame waits.
+
+        Raises RateLimitError if frames leave no time for it within _IDLE_WAIT_S. Call it on a thread of your own.
+        """
+        end_s = time.monotonic() + _IDLE_WAIT_S
+        while time.monotonic() < end_s:
+            # of what waits, this then runs after the frames
+            done = self._submit(lambda: None if self._queue else (function(self._mapper),)).result()
+            if done is not None:
+                return done[0]
+        raise RateLimitError(
+            f"views: expected time left after mapping, got none within {_IDLE_WAIT_S:g} s; call again later",
+            retry_after_s=_IDLE_WAIT_S,
+        )
 
     def end_idle_training(self) -> Future[None]:
         """End idle training until the next frame, and publish its changes."""

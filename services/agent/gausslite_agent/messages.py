@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray
-
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.convert import encode_colour, encode_depth, enum_numbers, transform_to_message, values_of
+from gausslite.wire.convert import enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
 from gausslite.wire.update_sender import UplinkCounters
 from gausslite_agent.mission import AgentMission
@@ -70,15 +66,4 @@ def _correction_to_message(status: WorkerStatus) -> pb.MapToOdometry | None:
         age_seconds=time.monotonic() - status.corrected_at_s,
         translation_std_m=correction.translation_std_m,
         rotation_std_deg=correction.rotation_std_deg,
-    )
-
-
-def view_to_message(
-    rgb: Float32[ndarray, "h w 3"], depth_m: Float32[ndarray, "h w"], map_revision: int
-) -> pb.RenderViewResponse:
-    """Encode a rendering as a colour and a depth image: colours in [0, 1], depth in metres."""
-    return pb.RenderViewResponse(
-        colour_png=encode_colour(np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8), lossless=True),
-        depth_png=encode_depth(depth_m),
-        map_revision=map_revision,
     )

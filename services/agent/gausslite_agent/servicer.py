@@ -29,11 +29,11 @@ from gausslite.domain.voxels import (
 )
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.runner import correct_live_frame
+from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
 from gausslite.wire.convert import (
     box_from_message,
-    camera_from_message,
     live_frame_from_message,
     transform_from_message,
 )
@@ -41,13 +41,19 @@ from gausslite.wire.convert_task import assigned_from_message, graph_to_message
 from gausslite.wire.map_changes import BLOCK_BYTES, EncodedPart, EncodedPartCache, Parts, encode_parts, follow
 from gausslite.wire.server import Service
 from gausslite.wire.update_sender import UplinkCounters
-from gausslite.wire.views import ChangeNotifier, camera_view_to_message
+from gausslite.wire.views import (
+    MAX_VIEWS_WAITING,
+    ChangeNotifier,
+    camera_view_to_message,
+    view_camera_from_message,
+    view_to_pngs,
+)
+from gausslite.wire.worker_pool import WorkerPool
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import (
     report_to_message,
     status_to_message,
     summary_to_message,
-    view_to_message,
 )
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
@@ -117,6 +123,7 @@ class AgentMapReader:
 
 
 _OUTCOMES_AHEAD = 16
+_ENCODERS, _MAX_WATCHERS_WAITING = 2, 1024
 
 
 class NewestTask:
@@ -159,7 +166,9 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         # a thread of its own: calls that wait for the mapper must not delay a frame
         self._decoder = ThreadPoolExecutor(1, "decode")
         # so do these, because the end of a mission and the hash of a whole map take long
-        self._ending, self._comparing = ThreadPoolExecutor(1, "end"), ThreadPoolExecutor(1, "compare")
+        self._ending, self._comparing = ThreadPoolExecutor(1, "end"), WorkerPool("compare", 1, _MAX_WATCHERS_WAITING)
+        self._encoding = WorkerPool("watchers", _ENCODERS, _MAX_WATCHERS_WAITING)
+        self._views, self._camera_views = (WorkerPool(name, waiting=MAX_VIEWS_WAITING) for name in ("views", "camera"))
         # used on the comparing thread only
         self._change_logs = {roi_only: MapChangeLog(worker.grid, roi_only) for roi_only in (False, True)}
 
@@ -209,30 +218,31 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         counters = UplinkCounters() if uplink is None else uplink.counters()
         return status_to_message(self._agent_id, self._mission, self._worker.status(), counters)
 
-    async def RenderView(self, request: pb.RenderViewRequest, _context: Any) -> pb.RenderViewResponse:  # noqa: N802
-        """Render the map from a pose."""
-        camera = camera_from_message(request.camera)
+    async def RenderView(self, request: pb.RenderViewRequest, context: Any) -> pb.RenderViewResponse:  # noqa: N802
+        """Render the map from a pose, one view at a time, when no frame waits."""
+        camera = view_camera_from_message(request.camera)
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
 
-        def render(mapper: GaussianMapper) -> pb.RenderViewResponse:
-            revision, size = self._worker.revision(), (camera.height_px, camera.width_px)
-            rgb, depth_m = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
-            if mapper.count > 0:
-                rendering = mapper.render(camera, T_world_camera)
-                rgb, depth_m = rendering.rgb, rendering.expected_depth_m()
-            return view_to_message(rgb, depth_m, revision)
+        def render(mapper: GaussianMapper) -> tuple[Rendering | None, int]:
+            return mapper.render(camera, T_world_camera) if mapper.count > 0 else None, self._worker.revision()
 
-        return await asyncio.wrap_future(self._worker.run(render))
+        def work() -> pb.RenderViewResponse:
+            # only rendered on the mapper's thread
+            rendering, revision = self._worker.run_when_idle(render)
+            return pb.RenderViewResponse(**view_to_pngs(camera, rendering), map_revision=revision)
+
+        return await self._views.run(context, work)
 
     async def GetCameraView(  # noqa: N802
-        self, _request: pb.GetCameraViewRequest, _context: Any
+        self, _request: pb.GetCameraViewRequest, context: Any
     ) -> pb.GetCameraViewResponse:
         """Return the newest keyframe, the camera's path and the newest detection."""
-        view = await asyncio.wrap_future(self._worker.camera_view())
-        return await asyncio.to_thread(camera_view_to_message, view)
+        return await self._camera_views.run(
+            context, lambda: camera_view_to_message(self._worker.camera_view().result())
+        )
 
     async def WatchMap(  # noqa: N802
-        self, request: pb.WatchMapRequest, _context: Any
+        self, request: pb.WatchMapRequest, context: Any
     ) -> AsyncIterator[pb.WatchMapResponse]:
         """Yield a snapshot of the map, then its changes. A slow reader gets merged changes; nothing is queued."""
         region = box_from_message(request.region) if request.HasField("region") else None
@@ -250,9 +260,10 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             return AgentMapReader(change_log.revision, cropped, key, encode, self._encoded_parts)
 
         async def read(since_revision: int) -> AgentMapReader:
-            return await asyncio.get_running_loop().run_in_executor(self._comparing, read_changes, since_revision)
+            return await self._comparing.run(context, read_changes, since_revision)
 
-        blocks = follow(read, self._worker.revision, request.since_revision, self._changes, asyncio.to_thread)
+        work = partial(self._encoding.run, context)
+        blocks = follow(read, self._worker.revision, request.since_revision, self._changes, work)
         async for block in blocks:
             yield pb.WatchMapResponse(block=block)
 

@@ -1,9 +1,7 @@
-"""Acknowledge the voxel updates that agents send, wherever these are stored; pace large keyframes."""
+"""Acknowledge the voxel updates that agents send, wherever these are stored."""
 
 from __future__ import annotations
 
-import asyncio
-import time
 from typing import NamedTuple
 
 from gausslite.domain.errors import GaussLiteError, MismatchError, SessionUnknownError, StorageError, UnavailableError
@@ -14,7 +12,6 @@ from gausslite.wire.status import code_and_reason
 
 STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
 """Errors that every later message would raise too, so they end the stream; other errors reject one message."""
-_QUICK_S, _PAUSE = 0.05, 2.0
 
 
 class StoredCount(NamedTuple):
@@ -64,26 +61,3 @@ class Acknowledger:
         self._acknowledged = max(self._acknowledged, request.sequence)
         outcome.sequence = request.sequence
         return pb.ContributeSubsetsResponse(acknowledged=self._acknowledged, outcomes=[outcome])
-
-
-class PacedLock:
-    """Held by one call at a time; after long work the next call waits twice as long, so that others have the disk."""
-
-    def __init__(self) -> None:
-        self._lock = asyncio.Lock()
-        self._begin_s = self._free_s = 0.0
-
-    async def __aenter__(self) -> None:
-        await self._lock.acquire()
-        try:
-            await asyncio.sleep(self._free_s - time.monotonic())
-        except BaseException:
-            self._lock.release()
-            raise
-        self._begin_s = time.monotonic()
-
-    async def __aexit__(self, *_: object) -> None:
-        end_s = time.monotonic()
-        if end_s - self._begin_s > _QUICK_S:
-            self._free_s = end_s + _PAUSE * (end_s - self._begin_s)
-        self._lock.release()

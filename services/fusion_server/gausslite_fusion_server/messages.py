@@ -21,14 +21,12 @@ from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import SessionRecord
-from gausslite.fusion.refinement import LayerView
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
 from gausslite.wire import convert
 from gausslite.wire.map_changes import read_deadline
 from gausslite.wire.security import Caller
-from gausslite.wire.views import region_from_png
 
 _MAX_SELECTED_KEYFRAMES = 10_000
 
@@ -59,7 +57,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     engine.settings.quotas.require_keyframe(message.index, pixels, message.ByteSize())
     # decoded here to refuse invalid images; stored as received, which needs less space
     frame = convert.frame_from_message(message)
-    region_from_png(message.region_png, frame.camera)
+    convert.decode_region(message.region_png, frame.camera)
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
     engine.keyframes.add(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES], request.session_id)
@@ -136,15 +134,6 @@ def layer_from_message(number: int) -> MapLayer:
     if number not in _LAYERS:
         raise InvalidInputError(f"layer: expected VOTE or REFINED, got {number}")
     return _LAYERS[number]
-
-
-def view_to_message(view: LayerView) -> pb.RenderFusedViewResponse:
-    """Encode a rendered view as PNG images."""
-    return pb.RenderFusedViewResponse(
-        colour_png=convert.encode_colour(view.rgb, lossless=True),
-        depth_png=convert.encode_depth(view.depth_m),
-        revision=view.revision,
-    )
 
 
 def declare_frame(engine: FusionEngine, request: pb.JoinSessionRequest) -> None:

@@ -24,9 +24,10 @@ from gausslite.wire.convert_task import graph_from_message, object_to_message, r
 from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
-from gausslite.wire.views import ChangeNotifier
+from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_from_message, view_to_pngs
+from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server import messages
-from gausslite_fusion_server.contributions import Acknowledger, PacedLock, StoredCount
+from gausslite_fusion_server.contributions import Acknowledger, StoredCount
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
@@ -83,12 +84,15 @@ async def _next(requests: AsyncIterator[_Message]) -> _Message | None:
 
 _log = logging.getLogger(__name__)
 MAX_REPORTED_REJECTIONS = 1000
-_WORKERS = 4
+_WORKERS, _MAX_WAITING = 4, 1024
+_KEYFRAME_PAUSE = 2.0
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
 _ALIGN_PAUSE = 4.0
 """Shortest pause after a comparison of an agent, in its durations: all together take a fifth of a core at most."""
 _ALIGN_RETRY_S = 30.0
+_SLICE_PAUSE = 4.0
+"""Pause after a slice of background work, in its durations."""
 
 _Result = TypeVar("_Result")
 
@@ -99,22 +103,24 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def __init__(self, engine: FusionEngine, refinement_worker: RefinementWorker) -> None:
         self.engine = engine
         self._refinement_worker = refinement_worker
-        self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
+        self._workers = WorkerPool("fusion server", _WORKERS, _MAX_WAITING)
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
         self._commit_is_due = False
         self._encoded_parts = EncodedPartCache()
-        # one thread each: a comparison of frames or a rendering must not delay the acknowledgements
+        # one thread each: a comparison of frames or a rendering must not delay the acknowledgements; encoding included
         self._aligner = ThreadPoolExecutor(1, "align")
-        self._background = ThreadPoolExecutor(1, "background")
+        self._views = WorkerPool("views", waiting=MAX_VIEWS_WAITING)
         self._aligning: asyncio.Task[None] | None = None
+        self._slices: asyncio.Task[None] | None = None
         self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
         self._renderer = MapRenderer(engine.maps, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
         self._rejections = RejectionLog(_log)
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
-        self._exports, self._queries, self._joins, self._keyframes = *(asyncio.Lock() for _ in range(3)), PacedLock()
+        self._exports, self._queries, self._joins = (WorkerPool(name) for name in ("exports", "queries", "joins"))
+        self._keyframes = WorkerPool("keyframes", pause=_KEYFRAME_PAUSE)
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -128,8 +134,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def drain(self) -> None:
         """End every open stream and every later call with UNAVAILABLE."""
         self._gate.close()
-        if self._aligning is not None:
-            self._aligning.cancel()
+        for task in (self._aligning, self._slices):
+            if task is not None:
+                task.cancel()
         self._map_changes.notify()
 
     async def store_message(self, session: SessionRecord, message: bytes | EncodedSubset) -> StoredCount:
@@ -148,6 +155,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes.notify()
         if self.engine.frames.are_compared:
             self._align_in_background()
+        if self.engine.has_background_work and self._gate.is_open and (self._slices is None or self._slices.done()):
+            self._slices = asyncio.create_task(self._work_in_slices())
 
     def _commit_soon(self) -> None:
         """Commit what is queued in the commit thread; one call serves all messages queued before it begins."""
@@ -162,8 +171,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def close(self) -> None:
         """Wait until the work in threads has ended."""
         self._aligner.shutdown(wait=True, cancel_futures=True)
-        self._background.shutdown(wait=True, cancel_futures=True)
-        self._workers.shutdown(wait=True)
+        for pool in (self._views, self._exports, self._queries, self._joins, self._keyframes, self._workers):
+            pool.close()
         self._committer.shutdown(wait=True)
         self._refinement_worker.close()
 
@@ -174,13 +183,15 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
         messages.declared_frame_from_message(request)
-        async with self._joins:
-            joined = await self._work(self.engine.join, request.agent_id, requested, request.fresh_map, request.token)
-        await self._work(messages.declare_frame, self.engine, request)
+        self._gate.require_open()
+        joined = await self._joins.run(
+            context, self.engine.join, request.agent_id, requested, request.fresh_map, request.token
+        )
+        await self._work(context, messages.declare_frame, self.engine, request)
         if task is not None:
-            objects = await self._work(self.engine.objects.of_task, request.agent_id, task)
-            await self._work(self.engine.objects.report, joined.session, ObjectReport(task, objects))
-        self._map_changes.notify()
+            objects = await self._work(context, self.engine.objects.of_task, request.agent_id, task)
+            await self._work(context, self.engine.objects.report, joined.session, ObjectReport(task, objects))
+        self.publish_changes()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
             highest_update_seq=joined.highest_update_seq,
@@ -195,14 +206,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
         """Renew the agent's lease; return what identifies the stored updates."""
-        return await self._work(messages.kept_session, self.engine, request.session_id, Caller.of(context))
+        return await self._work(context, messages.kept_session, self.engine, request.session_id, Caller.of(context))
 
     async def GetUpdateDigests(
         self, request: pb.GetUpdateDigestsRequest, context: Any
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of the agent's stored updates."""
-        agent_id = (await self._session(request.session_id, Caller.of(context))).agent_id
-        for block in convert.digests_to_messages(await self._work(self.engine.store.digests, agent_id)):
+        agent_id = (await self._session(request.session_id, context)).agent_id
+        for block in convert.digests_to_messages(await self._work(context, self.engine.store.digests, agent_id)):
             with read_deadline():
                 yield block
 
@@ -210,11 +221,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message."""
-        caller, session = Caller.of(context), None
-        stream = Acknowledger(caller, self.engine.traffic, self._rejections)
+        session = None
+        stream = Acknowledger(Caller.of(context), self.engine.traffic, self._rejections)
         async for request in self._gate.admit(request_iterator):
             if session is None or session.session_id != request.session_id:
-                session = await self._session(request.session_id, caller)
+                session = await self._session(request.session_id, context)
             try:
                 stored = await self.store_message(session, request.subset)
                 answer = stream.accept(request, session.agent_id, stored)
@@ -229,8 +240,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         response, caller = pb.ContributeKeyframesResponse(), Caller.of(context)
         async for request in self._gate.admit(request_iterator):
             try:
-                async with self._keyframes:
-                    await self._work(messages.store_keyframe, self.engine, request, caller)
+                self._gate.require_open()
+                await self._keyframes.run(context, messages.store_keyframe, self.engine, request, caller)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
                 if len(response.rejected) >= MAX_REPORTED_REJECTIONS:
@@ -242,7 +253,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
         """Return a stored keyframe of an agent, for a person."""
         self.engine.members.require_mission(request.mission_id)
-        return await self._work(messages.read_keyframe, self.engine, request)
+        return await self._work(context, messages.read_keyframe, self.engine, request)
 
     async def WatchFusedMap(
         self, request: pb.WatchFusedMapRequest, context: Any
@@ -255,11 +266,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         async def read(_since_revision: int) -> FusedMapReader:
             return reader
 
+        work = functools.partial(self._work, context)
+
         def revision() -> int:
             self._gate.require_open()
             return self.engine.maps.revision(watched.layer)
 
-        async for block in follow(read, revision, request.since_revision, self._map_changes, self._work):
+        async for block in follow(read, revision, request.since_revision, self._map_changes, work):
             yield pb.WatchFusedMapResponse(block=block)
 
     async def RefineFusedMap(
@@ -283,26 +296,27 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Send a map as the bytes of a PLY file."""
         self.engine.members.require_mission(request.mission_id)
 
-        async with self._exports:
-            batch = await self._work(messages.select_map, self.engine, request)
+        def export() -> messages.ExportedFile:
             world_frame = self.engine.members.mission_config.given_world_frame
-            exported = await self._work(messages.ExportedFile, batch, world_frame)
-            del batch
+            return messages.ExportedFile(messages.select_map(self.engine, request), world_frame)
+
+        self._gate.require_open()
+        exported = await self._exports.run(context, export)
         async for chunk in exported.chunks():
             self._gate.require_open()
             yield chunk
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
-        session = await self._session(request.session_id, Caller.of(context))
-        await self._work(self.engine.objects.report, session, report_from_message(request))
+        session = await self._session(request.session_id, context)
+        await self._work(context, self.engine.objects.report, session, report_from_message(request))
         return pb.ReportObjectsResponse()
 
     async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
         """Return the team's objects that a noun names, or all."""
         self.engine.members.require_mission(request.mission_id)
-        async with self._queries:
-            return await self._work(self._find_objects, request.noun)
+        self._gate.require_open()
+        return await self._queries.run(context, self._find_objects, request.noun)
 
     def _find_objects(self, noun: str) -> pb.QueryObjectsResponse:
         found = self.engine.query_objects(noun)
@@ -312,16 +326,20 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Render a layer of the map from a camera pose."""
         self._gate.require_open()
         self.engine.members.require_mission(request.mission_id)
-        camera = convert.camera_from_message(request.camera)
+        camera = view_camera_from_message(request.camera)
         T_world_camera = convert.transform_from_message("t_world_camera", request.t_world_camera)
         layer = messages.layer_from_message(request.layer)
-        render = functools.partial(self._renderer.render, camera, T_world_camera, layer)
-        return messages.view_to_message(await asyncio.get_running_loop().run_in_executor(self._background, render))
+
+        def work() -> pb.RenderFusedViewResponse:
+            rendering, revision = self._renderer.render(camera, T_world_camera, layer)
+            return pb.RenderFusedViewResponse(**view_to_pngs(camera, rendering), revision=revision)
+
+        return await self._views.run(context, work)
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
         self.engine.members.require_mission(request.mission_id)
-        status = await self._work(self.engine.status)
+        status = await self._work(context, self.engine.status)
         return pb.GetSessionStatusResponse(
             mission_id=status.mission_config.mission_id,
             grid=convert.grid_to_message(self.engine.grid),
@@ -333,15 +351,15 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         """End a session; with `forget` the agent's updates are deleted."""
-        await self._session(request.session_id, Caller.of(context))
-        revision = await self._work(self.engine.leave, request.session_id, request.forget)
+        await self._session(request.session_id, context)
+        revision = await self._work(context, self.engine.leave, request.session_id, request.forget)
         self.publish_changes()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
     async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
         """End an agent's session and delete its data; with `ban` its later joins are refused."""
         self.engine.members.require_mission(request.mission_id)
-        voxels = await self._work(self.engine.evict, request.agent_id, request.ban)
+        voxels = await self._work(context, self.engine.evict, request.agent_id, request.ban)
         self.publish_changes()
         _log.warning(
             "agent %s: %s, data of %d voxels deleted", request.agent_id, "banned" if request.ban else "evicted", voxels
@@ -351,7 +369,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
         """Let a banned agent join again."""
         self.engine.members.require_mission(request.mission_id)
-        await self._work(self.engine.unban, request.agent_id)
+        await self._work(context, self.engine.unban, request.agent_id)
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
 
@@ -380,14 +398,29 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             if run.is_changed:
                 self._map_changes.notify()
 
-    async def _session(self, session_id: str, caller: Caller) -> SessionRecord:
+    async def _work_in_slices(self) -> None:
+        """Do the engine's background work, with pauses in which others have the disk and the processor."""
+        loop = asyncio.get_running_loop()
+        while self.engine.has_background_work and self._gate.is_open:
+            start_s = loop.time()
+            try:
+                await loop.run_in_executor(None, self.engine.work_in_background)
+                pause_s = _SLICE_PAUSE * (loop.time() - start_s)
+            except GaussLiteError as error:
+                _log.error("former maps are not deleted, again in %.0f s: %s", _ALIGN_RETRY_S, error)
+                pause_s = _ALIGN_RETRY_S
+            self._map_changes.notify()
+            await asyncio.sleep(pause_s)
+
+    async def _session(self, session_id: str, context: Any) -> SessionRecord:
         """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
+        caller = Caller.of(context)
         if self.engine.members.sessions.known(session_id) is None:
             # it asks the store
-            return await self._work(messages.session_of, self.engine, session_id, caller)
+            return await self._work(context, messages.session_of, self.engine, session_id, caller)
         return messages.session_of(self.engine, session_id, caller)
 
-    async def _work(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
-        """Run the function in a worker thread. Raises UnavailableError if the server drains."""
+    async def _work(self, context: Any, function: Callable[..., _Result], *arguments: Any) -> _Result:
+        """Run the function in a worker thread. Raises UnavailableError if the server drains, RateLimitError."""
         self._gate.require_open()
-        return await asyncio.get_running_loop().run_in_executor(self._workers, function, *arguments)
+        return await self._workers.run(context, function, *arguments)

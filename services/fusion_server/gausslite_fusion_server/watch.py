@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -72,32 +74,44 @@ class FusedMapReader:
         if newest == since_revision:
             return since_revision, ()
         is_first = since_revision == self.since_revision
-        revision = newest if is_first else self.cache.step((self.watched, since_revision), newest)
+        shared = replace(self.watched, exclude_agent="")
+        revision = newest if is_first else self.cache.step((shared, since_revision), newest)
 
         # the map is read once for all watchers that follow closely
-        def encode() -> tuple[EncodedPart, ...]:
-            changes = self.engine.maps.changes(since_revision, self.watched.layer)
-            won = self._select(self.watched, changes.won)
+        def encode(watched: WatchedPart) -> tuple[EncodedPart, ...]:
+            changes = self.engine.maps.changes(since_revision, watched.layer)
+            won = self._select(watched, changes.won)
             changed = np.union1d(changes.won.batch.keys, changes.removed)
-            if self.watched.region is not None:
-                changed = changed[self.watched.region.contains(self.engine.grid.centres_m(changed))]
+            if watched.region is not None:
+                changed = changed[watched.region.contains(self.engine.grid.centres_m(changed))]
             return _encode(won, np.setdiff1d(changed, won.batch.keys), self.engine.grid)
 
-        return revision, (self.cache.get((self.watched, since_revision, revision), encode),)
+        return revision, (self._shared(self.watched, (since_revision, revision), encode),)
 
     def _tile(self, tile: int) -> tuple[EncodedPart, ...]:
         """Return a tile as it is now; a tile completely in the region is shared with other watchers."""
         watched = self.watched
         if watched.region is not None and _contains(watched.region, tile, self.engine.grid):
-            watched = WatchedPart(watched.layer, None, watched.exclude_agent)
+            watched = replace(watched, region=None)
         # read before the tile: a change in between makes the kept tile newer than its revision, never older
         revision = self.engine.maps.tile_revision(watched.layer, tile)
 
-        def encode() -> tuple[EncodedPart, ...]:
+        def encode(watched: WatchedPart) -> tuple[EncodedPart, ...]:
             won = self._select(watched, self.engine.maps.tile(watched.layer, tile))
             return _encode(won, np.zeros(0, np.int64), self.engine.grid)
 
-        return self.cache.get((watched, tile, revision), encode)
+        return self._shared(watched, (tile, revision), encode)
+
+    def _shared(
+        self, watched: WatchedPart, key: tuple[int, int], encode: Callable[[WatchedPart], tuple[EncodedPart, ...]]
+    ) -> tuple[EncodedPart, ...]:
+        """Return parts from the cache; an agent that wins nothing in them is excluded by those of all watchers."""
+        everyone = replace(watched, exclude_agent="")
+        parts = self.cache.get((everyone, *key), partial(encode, everyone))
+        winners = {name for _, provenance in parts if provenance is not None for name in provenance.agent_ids}
+        if watched.exclude_agent in winners:
+            return self.cache.get((watched, *key), partial(encode, watched))
+        return parts
 
     def _select(self, watched: WatchedPart, won: WonVoxels) -> WonVoxels:
         if watched.exclude_agent:

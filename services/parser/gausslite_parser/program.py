@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,21 +20,23 @@ from gausslite.wire.convert_task import graph_to_message
 from gausslite.wire.run_service import run_service
 from gausslite.wire.security import Tls, TlsFiles
 from gausslite.wire.server import Service, serve_until_stopped
+from gausslite.wire.worker_pool import WorkerPool
 
+_WORKERS = 2  # a language model that is slow to answer one caller leaves a thread for others
 SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].full_name
 
 
 class ParserServicer(parser_service_pb2_grpc.ParserServiceServicer):
-    """Stateless; the parser runs on another thread, because it may be slow."""
+    """Stateless; the parser runs on other threads, because it may be slow."""
 
     def __init__(self, parser: TaskParser) -> None:
-        self._parser = parser
+        self._parser, self._workers = parser, WorkerPool("parser", _WORKERS)
 
     async def ParseTask(  # noqa: N802 (gRPC's name)
-        self, request: parser_service_pb2.ParseTaskRequest, _context: Any
+        self, request: parser_service_pb2.ParseTaskRequest, context: Any
     ) -> parser_service_pb2.ParseTaskResponse:
         """Return the graph of one task; a TaskError becomes INVALID_ARGUMENT TASK."""
-        graph = await asyncio.to_thread(self._parser.parse, request.text)
+        graph = await self._workers.run(context, self._parser.parse, request.text)
         return parser_service_pb2.ParseTaskResponse(graph=graph_to_message(graph))
 
 

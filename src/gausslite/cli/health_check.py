@@ -18,10 +18,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Return 0 if the service is SERVING, 1 with one line on stderr if not, 2 for wrong options."""
     parser = CommandParser(prog="python -m gausslite.cli.health_check")
     parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
+    parser.add_argument("service", nargs="?", default="", help="liveness: only whether the process answers")
     add_flags(parser, TlsFiles)
     options = parser.parse_args(arguments)
     try:
-        require_serving(options.address, build(TlsFiles, options).read())
+        require_serving(options.address, build(TlsFiles, options).read(), options.service)
     except InvalidInputError as error:
         print_message(str(error))
         return 2

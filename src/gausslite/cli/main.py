@@ -18,9 +18,8 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.plugins import Command, Group, absent_package, load, names
 from gausslite.process import Terminated, print_message, raise_interrupts
 
-_SUMMARIES: Final = {
-    "map": "map a sequence for a task; write map.ply, report.json and preview.png",
-    "fuse": "fuse map files into one by a vote in every voxel",
+_CORE: Final = {
+    "map": Command("map a sequence for a task; write map.ply, report.json and preview.png", "gausslite.cli.map_command")
 }
 
 
@@ -39,8 +38,7 @@ class _PrintVersion(argparse.Action):
 
 def commands() -> dict[str, Command]:
     """Return the sub-commands: those of the core, then those of the packages beside it."""
-    core = {name: Command(summary, f"gausslite.cli.{name}_command") for name, summary in _SUMMARIES.items()}
-    return core | {name: _plugin(name) for name in names(Group.COMMANDS) if name not in core}
+    return _CORE | {name: _plugin(name) for name in names(Group.COMMANDS) if name not in _CORE}
 
 
 def _plugin(name: str) -> Command:

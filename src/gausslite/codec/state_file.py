@@ -8,10 +8,10 @@ format cannot contain code.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
-import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,30 +40,47 @@ def write_atomic(path: Path, data: bytes) -> None:
     write_atomic_with(path, lambda temporary: temporary.write_bytes(data))
 
 
-def write_atomic_with(path: Path, write: Callable[[Path], object]) -> None:
+def write_atomic_with(path: Path, write: Callable[[Path], object], mode: int = 0o644) -> None:
     """Let `write` fill a temporary file in the same folder, then rename it to `path`.
 
-    Raises StorageError if `path` is not a regular file, the folder is not writable or the disk is full.
+    The next write of this path replaces what a killed one left. Raises StorageError if `path` is not a regular file,
+    the folder is not writable or the disk is full.
     """
-    temporary: Path | None = None
+    temporary = path.with_name(f".{path.name}.partial")
     try:
         if path.exists() and not path.is_file():
             raise StorageError(f"{path}: expected a regular file or none, got something else")
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(descriptor)
-        temporary = Path(name)
-        write(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except BaseException as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-        if isinstance(error, OSError):
-            raise _cannot_write(path, error) from error
-        raise
+        with _locked(temporary):
+            try:
+                write(temporary)
+                with temporary.open("rb") as file:
+                    os.fsync(file.fileno())
+                temporary.chmod(mode)
+                temporary.replace(path)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    temporary.unlink()
+                raise
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Make a file that one writer at a time has under this name, or take over that of a killed one."""
+    while True:
+        with path.open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                is_own = os.path.samestat(path.stat(), os.fstat(file.fileno()))
+            except FileNotFoundError:
+                # the writer before has renamed it
+                is_own = False
+            if is_own:
+                path.chmod(0o600)
+                file.truncate(0)
+                yield
+                return
 
 
 def _cannot_write(path: Path, error: OSError) -> StorageError:
@@ -99,12 +116,12 @@ _LENGTH_BYTES = 8
 _MAX_HEADER_BYTES = 1 << 24
 
 
-def write_state(path: Path, state: State) -> None:
+def write_state(path: Path, state: State, mode: int = 0o644) -> None:
     """Write the arrays atomically. Raises StorageError."""
     arrays = {name: np.asarray(array, order="C") for name, array in state.items()}
     metadata = {"format": FORMAT, "version": VERSION, "crc32": _checksum(arrays)}
     try:
-        write_atomic_with(path, lambda temporary: save_file(arrays, temporary, metadata))
+        write_atomic_with(path, lambda temporary: save_file(arrays, temporary, metadata), mode)
     except SafetensorError as error:
         raise StorageError(f"{path}: cannot be written: {error}") from error
 

@@ -74,6 +74,11 @@ class Relation:
     min_m: float | None = None
     max_m: float | None = None
 
+    @property
+    def is_bounded(self) -> bool:
+        """True if the distance to the anchor is limited."""
+        return self.min_m is not None or self.max_m is not None
+
     def __str__(self) -> str:
         """Return a form for people, such as "not on(mug, table)"."""
         bounds = "".join(

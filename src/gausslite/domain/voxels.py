@@ -75,12 +75,12 @@ class RoiSubset:
 
 
 MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
-_BITS_PER_AXIS = 21
-_OFFSET = 1 << (_BITS_PER_AXIS - 1)
-_MASK = (1 << _BITS_PER_AXIS) - 1
+BITS_PER_AXIS = 21
+_OFFSET = 1 << (BITS_PER_AXIS - 1)
+_MASK = (1 << BITS_PER_AXIS) - 1
 TILE_VOXELS = 16
 """Voxels of a tile along each axis."""
-_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * _BITS_PER_AXIS) for axis in range(3))
+_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * BITS_PER_AXIS) for axis in range(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ class VoxelGrid:
 
     def indices(self, keys: Int64[ndarray, " n"]) -> Int64[ndarray, "n 3"]:
         """Return the (i, j, k) of the voxels with these keys."""
-        ijk = np.stack([(keys >> (2 * _BITS_PER_AXIS)) & _MASK, (keys >> _BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
+        ijk = np.stack([(keys >> (2 * BITS_PER_AXIS)) & _MASK, (keys >> BITS_PER_AXIS) & _MASK, keys & _MASK], axis=1)
         return ijk - _OFFSET
 
     def centres_m(self, keys: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
@@ -156,7 +156,7 @@ def tiles_of(keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
 
 def _pack(axes: Float64[ndarray, "3 n"]) -> Int64[ndarray, " n"]:
     i, j, k = axes.astype(np.int64) + _OFFSET
-    packed: Int64[ndarray, " n"] = (i << (2 * _BITS_PER_AXIS)) | (j << _BITS_PER_AXIS) | k
+    packed: Int64[ndarray, " n"] = (i << (2 * BITS_PER_AXIS)) | (j << BITS_PER_AXIS) | k
     return packed
 
 

@@ -63,7 +63,7 @@ class FrameDecisions:
     alignments: Mapping[str, FrameAlignment] = field(default_factory=dict)
     """The agents whose alignment is another one now."""
     deleted: tuple[str, ...] = ()
-    """Earlier maps that their agents' newer ones contradict."""
+    """Former maps that their agents' newer ones contradict."""
     is_due: bool = False
     """Whether more agents wait for a comparison."""
     failure: str = ""

@@ -1,73 +1,118 @@
-"""Record which agent wins each voxel and at which revision the voxel last changed, for the status and the watchers."""
+"""Record which map wins each voxel and at which revision the voxel last changed, for the status and the watchers."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+import itertools
+from collections import OrderedDict
+from collections.abc import Mapping
 from copy import copy
 
 import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS, RevisionLog
-from gausslite.domain.voxels import tile_of, tiles_of
+from gausslite.domain.errors import RevisionGoneError
+from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
+from gausslite.fusion.tile_tables import Table, by_tile, find, keys_of, offsets_of, replaced
 from gausslite.fusion.vote import VoteResult
+
+_CHANGED = np.dtype([("offsets", "u2"), ("winners", "u2"), ("counts", "u4"), ("revisions", "i8")])
+_NOBODY = (1 << 16) - 1
+_NO_TABLE: Table = np.zeros(0, _CHANGED)
+_ABSENT = np.array((0, _NOBODY, 0, 0), _CHANGED)
 
 
 class VoxelLog:
     """One layer of the fused map: its voxels, and the revision of the last change of each and of each tile.
 
-    A tile has 16 x 16 x 16 voxels; its name is the smallest key that it can hold. Not thread-safe.
+    It has 16 bytes for each voxel of the layer, and the latest `max_removed` voxels that became empty. A watcher that
+    misses an older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a
+    restart. A tile has 16 x 16 x 16 voxels; its name is the smallest key that it can hold. Not thread-safe.
     """
 
     def __init__(self, first_revision: int, max_removed: int) -> None:
-        self.revisions = RevisionLog(first_revision, max_removed)
-        self._keys: dict[int, set[int]] = {}
-        self._tile_revisions: dict[int, int] = {}
-
-    def __contains__(self, key: int) -> bool:
-        return key in self._keys.get(tile_of(key), ())
+        self.revision = self._oldest = first_revision
+        self._max_removed = max_removed
+        # both in the order of the revisions, so that changed_since reads only what changed
+        self._tiles: dict[int, tuple[int, Table]] = {}
+        self._removed_at: OrderedDict[int, int] = OrderedDict()
 
     def copy(self) -> VoxelLog:
         """Return an equal log that changes on its own."""
         other = copy(self)
-        other.revisions, other._tile_revisions = self.revisions.copy(), dict(self._tile_revisions)
-        other._keys = {tile: set(keys) for tile, keys in self._keys.items()}
+        other._tiles, other._removed_at = dict(self._tiles), OrderedDict(self._removed_at)
         return other
 
     def tiles(self) -> Int64[ndarray, " t"]:
         """Return the tiles that have voxels, ascending."""
-        return np.sort(np.fromiter(self._keys, np.int64, len(self._keys)))
+        return np.sort(np.fromiter(self._tiles, np.int64, len(self._tiles)))
 
     def keys(self, tile: int) -> Int64[ndarray, " k"]:
         """Return the voxels of a tile, ascending."""
-        return np.array(sorted(self._keys.get(tile, ())), np.int64)
+        return keys_of([tile], [self._tiles.get(tile, (0, _NO_TABLE))[1]])
 
     def all_keys(self) -> Int64[ndarray, " k"]:
         """Return the voxels of all tiles, ascending."""
-        return np.array(sorted(set().union(*self._keys.values())), np.int64)
+        return np.sort(keys_of(list(self._tiles), [table for _, table in self._tiles.values()]))
 
     def tile_revision(self, tile: int) -> int:
-        """Return the revision of the last change in a tile; 0 if it never had voxels."""
-        return self._tile_revisions.get(tile, 0)
+        """Return the revision of the last change in a tile; the current one if it has no voxels."""
+        return self._tiles[tile][0] if tile in self._tiles else self.revision
 
-    def record(self, changed: Collection[int], removed: Collection[int] = ()) -> None:
-        """Record as one revision that these voxels changed or became empty; nothing without any."""
-        if not (changed or removed):
+    def find(self, keys: Int64[ndarray, " k"]) -> Table:
+        """Return the winner, the number of Gaussians and the revision of each voxel; _ABSENT of others."""
+        found, offsets = np.full(len(keys), _ABSENT), offsets_of(keys)
+        for tile, places in by_tile(keys):
+            if tile in self._tiles:
+                table = self._tiles[tile][1]
+                at = find(table, offsets[places])
+                found[places[at >= 0]] = table.take(at[at >= 0])
+        return found
+
+    def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
+        """Return the keys of the voxels that changed or became empty after this revision, ascending.
+
+        Raises RevisionGoneError if the revision is from before a restart, or older than a removal no longer recorded.
+        """
+        if not self._oldest <= revision <= self.revision:
+            raise RevisionGoneError(
+                f"since_revision: expected {self._oldest} to {self.revision}, or 0 for a snapshot, got {revision}"
+            )
+        newest = itertools.takewhile(lambda tile: self._tiles[tile][0] > revision, reversed(self._tiles))
+        tables = {tile: self._tiles[tile][1] for tile in newest}
+        recent = {tile: table[table["revisions"] > revision] for tile, table in tables.items()}
+        removed = itertools.takewhile(lambda key: self._removed_at[key] > revision, reversed(self._removed_at))
+        return np.sort(np.append(keys_of(list(recent), list(recent.values())), np.array(list(removed), np.int64)))
+
+    def touch(self, keys: Int64[ndarray, " k"]) -> None:
+        """Record as one revision that these voxels of the layer have changed."""
+        self.record(keys, np.zeros(0, np.int64), self.find(keys))
+
+    def record(self, changed: Int64[ndarray, " k"], removed: Int64[ndarray, " r"], won: Table | None = None) -> None:
+        """Record as one revision that these voxels changed or became empty; nothing without any.
+
+        Keys ascend. won: the winner of each changed voxel, and the number of its Gaussians.
+        """
+        if not (len(changed) or len(removed)):
             return
-        revision = self.revisions.revision + 1
-        self.revisions.record(changed, removed, revision)
-        tiles = tiles_of(np.fromiter(changed, np.int64, len(changed))).tolist()
-        for key, tile in zip(changed, tiles, strict=True):
-            self._keys.setdefault(tile, set()).add(key)
-        self._tile_revisions.update(dict.fromkeys(tiles, revision))
-        for key in removed:
-            tile = tile_of(key)
-            own = self._keys.get(tile, set())
-            own.discard(key)
-            if not own:
-                self._keys.pop(tile, None)
-            self._tile_revisions[tile] = revision
+        self.revision += 1
+        keys = np.append(changed, removed)
+        offsets = offsets_of(keys)
+        added = np.zeros(len(changed), _CHANGED) if won is None else won.copy()
+        added["offsets"], added["revisions"] = offsets[: len(changed)], self.revision
+        for tile, places in by_tile(keys):
+            table = self._tiles.pop(tile, (0, _NO_TABLE))[1]
+            here = added.take(places[places < len(changed)]) if len(removed) else added.take(places)
+            table = replaced(table, find(table, offsets[places]), here) if len(table) else here
+            if len(table):
+                self._tiles[tile] = self.revision, table
+        for key in changed.tolist() if self._removed_at else ():
+            self._removed_at.pop(key, None)
+        for key in removed.tolist():
+            self._removed_at[key] = self.revision
+            if len(self._removed_at) > self._max_removed:
+                _, dropped_revision = self._removed_at.popitem(last=False)
+                self._oldest = max(self._oldest, dropped_revision)
 
 
 class ChangeLog:
@@ -78,69 +123,75 @@ class ChangeLog:
 
     def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:
         self.voxels = VoxelLog(first_revision, max_removed)
-        self._winner: dict[int, tuple[str, int]] = {}
-        self._won_voxels: dict[str, int] = {}
+        # of each map that has won a voxel: its number in the log
+        self._numbers: dict[str, int] = {}
+        self._won_voxels: dict[int, int] = {}
         self.fused_gaussians = 0
         """The number of Gaussians of the fused map."""
 
     @property
     def fused_voxels(self) -> int:
         """The number of voxels of the fused map."""
-        return len(self._winner)
+        return sum(self._won_voxels.values())
 
-    def won_voxels(self, agent_id: str) -> int:
-        """Return the number of voxels that the agent wins."""
-        return self._won_voxels.get(agent_id, 0)
+    def won_voxels(self, name: str) -> int:
+        """Return the number of voxels that the map wins."""
+        return self._won_voxels.get(self._numbers.get(name, _NOBODY), 0)
 
-    def winners(self, keys: Iterable[int]) -> dict[str, list[int]]:
+    def winners(self, keys: Int64[ndarray, " k"]) -> dict[str, Int64[ndarray, " w"]]:
         """Return those of the voxels that are in the fused map, by winner."""
-        won: dict[str, list[int]] = {}
-        for key in keys:
-            winner = self._winner.get(key)
-            if winner is not None:
-                won.setdefault(winner[0], []).append(key)
-        return won
+        won = self.voxels.find(keys)["winners"]
+        present = set(won.tolist())
+        return {name: keys[won == number] for name, number in self._numbers.items() if number in present}
 
     def load(self, vote: VoteResult) -> None:
         """Record the first result of the vote, on all voxels."""
-        winners = _winners(vote)
-        for key, winner in winners.items():
-            self._set(key, winner)
-        self.voxels.record(winners.keys())
+        self._record(vote.keys, np.full(len(vote), _ABSENT), self._winners(vote.keys, vote))
 
     def record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]], vote: VoteResult) -> Int64[ndarray, " c"]:
-        """Record which voxels changed by agent, as one revision; `vote` is the new result on these voxels.
+        """Record which voxels changed by map, as one revision; `vote` is the new result on these voxels.
 
-        Returns the voxels where the fused map changed: those that such an agent wins now or won before.
+        Returns the voxels where the fused map changed: those that such a map wins now or won before.
         """
-        new_winner = _winners(vote)
-        changed: dict[int, None] = {}
-        removed: dict[int, None] = {}
-        for agent_id, keys in changed_keys.items():
-            for key in keys.tolist():
-                new, old = new_winner.get(key), self._winner.get(key)
-                # after another agent has replaced the old winner, `old` is the new one
-                if agent_id in (new and new[0], old and old[0]):
-                    if new != old:
-                        self._set(key, new)
-                    (removed if new is None else changed)[key] = None
-        self.voxels.record(changed.keys(), removed.keys())
-        return np.array(sorted([*changed, *removed]), np.int64)
+        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *changed_keys.values()]))
+        before, won = self.voxels.find(keys), self._winners(keys, vote)
+        is_changed = np.zeros(len(keys), np.bool_)
+        for name, own in changed_keys.items():
+            number, places = self._numbers.get(name, _NOBODY + 1), np.searchsorted(keys, own)
+            is_changed[places[(won["winners"][places] == number) | (before["winners"][places] == number)]] = True
+        self._record(keys[is_changed], before[is_changed], won[is_changed])
+        return keys[is_changed]
 
-    def _set(self, key: int, new: tuple[str, int] | None) -> None:
-        old = self._winner.pop(key, None)
-        if old is not None:
-            self._won_voxels[old[0]] -= 1
-            self.fused_gaussians -= old[1]
-        if new is not None:
-            self._winner[key] = new
-            self._won_voxels[new[0]] = self._won_voxels.get(new[0], 0) + 1
-            self.fused_gaussians += new[1]
+    def _record(self, keys: Int64[ndarray, " k"], before: Table, won: Table) -> None:
+        for table, sign in ((before, -1), (won, 1)):
+            self.fused_gaussians += sign * int(table["counts"].sum(dtype=np.int64))
+            numbers, counts = np.unique(table["winners"][table["winners"] != _NOBODY], return_counts=True)
+            for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
+                self._won_voxels[number] = self._won_voxels.get(number, 0) + sign * count
+        is_present = won["winners"] != _NOBODY
+        self.voxels.record(keys[is_present], keys[~is_present], won[is_present])
 
+    def rename(self, name: str, other: str) -> None:
+        """Give a map another name."""
+        if name in self._numbers:
+            self._numbers[other] = self._numbers.pop(name)
 
-def _winners(vote: VoteResult) -> dict[int, tuple[str, int]]:
-    """Return the winner of each voxel and the number of its Gaussians."""
-    winners = vote.winners
-    names = (winners.agents[index] for index in winners.agent_index.tolist())
-    counts = winners.scores["counts"].tolist()
-    return dict(zip(winners.scores["keys"].tolist(), zip(names, counts, strict=True), strict=True))
+    def forget(self, name: str) -> None:
+        """Free the number of a map that wins no voxel."""
+        self._won_voxels.pop(self._numbers.pop(name, _NOBODY), None)
+
+    def _winners(self, keys: Int64[ndarray, " k"], vote: VoteResult) -> Table:
+        """Return the winner of each of these ascending voxels, and the number of its Gaussians."""
+        won, winners = np.full(len(keys), _ABSENT), vote.winners
+        numbers = np.zeros(len(winners.agents), np.uint16)
+        for index in np.unique(winners.agent_index).tolist():
+            numbers[index] = self._number(winners.agents[index])
+        places = np.searchsorted(keys, winners.scores["keys"])
+        won["winners"][places], won["counts"][places] = numbers[winners.agent_index], winners.scores["counts"]
+        return won
+
+    def _number(self, name: str) -> int:
+        if name not in self._numbers:
+            used = set(self._numbers.values())
+            self._numbers[name] = next(number for number in itertools.count() if number not in used)
+        return self._numbers[name]

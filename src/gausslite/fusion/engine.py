@@ -15,15 +15,24 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.encoded_voxels import EncodedSubset
-from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError, UnavailableError
+from gausslite.domain.checks import quote_name
+from gausslite.domain.errors import GaussLiteError, MismatchError, QuotaError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.alignment import FrameAligner, FrameDecisions, TeamView
-from gausslite.fusion.earlier_map import earlier_map_of
+from gausslite.fusion.epochs import MAX_FORMER_MAPS, agent_of, is_former
+from gausslite.fusion.frames import RECORD as ALIGNMENT
 from gausslite.fusion.frames import FrameAlignments
-from gausslite.fusion.fused_map import FusedMapLayers, load_refinement, save_refinement
-from gausslite.fusion.keyframe_pool import AgentKeyframe, FrameDecoder, KeyframePool, in_fused_frame, no_decoder
+from gausslite.fusion.fused_map import FusedMapLayers, MapLayer, load_refinement, save_refinement
+from gausslite.fusion.keyframe_pool import (
+    ORDER_RECORD,
+    AgentKeyframe,
+    FrameDecoder,
+    KeyframePool,
+    in_fused_frame,
+    no_decoder,
+)
 from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.objects import RECORD as OBJECTS
@@ -32,10 +41,10 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.update_log import PutOutcome
 from gausslite.fusion.updates import MissionClock, PendingUpdate, UpdateChecks, UpdateQueue, require_own, store_slices
-from gausslite.fusion.vote import fuse
 from gausslite.fusion.vote_input import VoteInput
 
 _log = logging.getLogger(__name__)
+_PUBLISHED_TILES = 8
 
 
 class JoinResult(NamedTuple):
@@ -97,22 +106,32 @@ class FusionEngine:
         self._checks = UpdateChecks(store, settings.quotas, MissionClock(store))
         self._unrecorded: dict[str, Int64[ndarray, " k"]] = {}
         self._aligner = aligner
-        for agent_id in store.agents():
-            self._observe(agent_id, store.keys(agent_id))
+        # maps that the aligner reads as a whole
+        self._unobserved = set(store.agents())
+        # former maps whose name the watchers do not have yet, with the tiles to publish
+        self._renamed: dict[str, list[int]] = {}
+        # former maps that are deleted, slice by slice
+        self._leaving: dict[str, None] = {}
+        for agent_id in sorted({agent_of(name) for name in store.agents() if is_former(name)}):
+            self._release_former(agent_id)
 
     def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False, token: str = "") -> JoinResult:
-        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see earlier_map.py.
+        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see epochs.py.
 
         Empty names in `requested` accept the server's. token: the robot's secret, see SessionRegistry. Raises
-        InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
+        InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError,
+        UnavailableError (a fresh map while the agent has too many).
         """
         with self._changing:
             for ended in self.members.admit(agent_id, requested, token):
                 self._remove_all(ended)
+            if fresh_map and len(self._former(agent_id)) > MAX_FORMER_MAPS:
+                name = quote_name(agent_id)
+                raise UnavailableError(f"agent {name}: its former maps are being deleted; try again in a moment")
             session = self.members.open_session(agent_id, token)
             if fresh_map:
-                self._begin_new_map(agent_id)
-                self.members.sessions.save(session, token)
+                self._begin_map(agent_id)
+                self._release_former(agent_id)
             self._checks.record_join(agent_id)
             highest = self.store.totals(agent_id).highest_update_seq
             return JoinResult(session, highest, self.maps.revision(), self.keyframes.indices(agent_id))
@@ -122,7 +141,8 @@ class FusionEngine:
         with self._changing:
             self.members.sessions.forget_elsewhere(agent_id)
             if fresh_map:
-                self._begin_new_map(agent_id)
+                self._begin_map(agent_id)
+                self._release_former(agent_id)
             return self.store.totals(agent_id).highest_update_seq
 
     def remove_elsewhere(self, agent_id: str) -> int:
@@ -133,7 +153,8 @@ class FusionEngine:
             self._remove_all(agent_id)
             # one that came here while the session ended
             self.store.remove_record(agent_id, OBJECTS)
-            return voxels
+        self._remove_leaving(agent_id)
+        return voxels
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -193,10 +214,29 @@ class FusionEngine:
             if not update.outcomes:
                 require_own(session.agent_id, update.agent_id, self.grid, self.grid)
                 self._checks.require_permitted(update.subset)
+            self._require_memory(update.next_slice())
         except GaussLiteError as error:
             update.fail(error)
             return False
         return True
+
+    def _require_memory(self, subset: EncodedSubset) -> None:
+        """Raise QuotaError if the agent's maps would exceed its share of the memory.
+
+        If it has a former one, that is released, and UnavailableError is raised until it has been deleted.
+        """
+        needed, limit = self.store.memory_bytes(subset.agent_id, subset.voxels.keys), self.settings.agent_bytes
+        if needed <= limit:
+            return
+        name = quote_name(subset.agent_id)
+        former = self._former(subset.agent_id)
+        if former:
+            self._release(min(former, key=self.maps.won_voxels))
+            raise UnavailableError(f"agent {name}: a former map is being deleted to make room; try again in a moment")
+        raise QuotaError(
+            f"agent {name}: expected voxels of at most {limit} bytes of memory (memory-mb divided by quota-agents), "
+            f"got {needed}"
+        )
 
     def _record(self, stored: Sequence[tuple[str, Int64[ndarray, " _"]]]) -> dict[str, GaussLiteError]:
         """Update the fused map after a commit of these voxels of different agents; returns the errors of agents.
@@ -217,7 +257,7 @@ class FusionEngine:
         failed |= self.maps.update({name: keys for name, keys in self._unrecorded.items() if name not in failed})
         for agent_id in [name for name in self._unrecorded if name not in failed]:
             self._observe(agent_id, self._unrecorded.pop(agent_id))
-            self._drop_outgrown(agent_id)
+            self._release_former(agent_id)
         return failed
 
     def _observe(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
@@ -232,6 +272,9 @@ class FusionEngine:
         """
         if self._aligner is None:
             return AlignmentRun(False, False)
+        while self._unobserved:
+            name = self._unobserved.pop()
+            self._aligner.observe(name, self.store.keys(name))
         before = self.maps.revision()
         self._move_maps()
         team = TeamView(self.frames.by_rank(), self.store, self.keyframes)
@@ -248,7 +291,7 @@ class FusionEngine:
         for name in found.deleted:
             if self.frames.has_frame(name, team.frames[name][0]):
                 _log.warning("%s: its agent's new map does not fit it, so it is deleted", name)
-                self._remove(name)
+                self._release(name)
         for name, alignment in found.alignments.items():
             frame_id, before = team.frames[name]
             # where an agent is in the team's map was found with the team's frames
@@ -323,74 +366,118 @@ class FusionEngine:
             self.members.sessions.end_agent(agent_id)
             if forget:
                 self._remove_all(agent_id)
-            return self.maps.revision()
+        self._remove_leaving(agent_id)
+        return self.maps.revision()
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
 
-        ban: refuse later joins under this name, also after a restart. The name of an earlier map deletes
-        only that. Raises InvalidInputError for an unknown agent that is not banned, StorageError.
+        ban: refuse later joins under this name, also after a restart. The name of a former map deletes only that.
+        Raises InvalidInputError for an unknown agent that is not banned, StorageError.
         """
         with self._changing:
             voxels = self.store.totals(agent_id).voxels
             self.members.require_evictable(agent_id, ban)
-            self.members.sessions.end_agent(agent_id)
-            self._remove_all(agent_id)
+            if is_former(agent_id):
+                self._release(agent_id)
+            else:
+                self.members.sessions.end_agent(agent_id)
+                self._remove_all(agent_id)
             if ban:
                 self.members.bans.add(agent_id)
-            return voxels
+        self._remove_leaving(agent_id)
+        return voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
         with self._changing:
             self.members.bans.remove(agent_id)
 
-    def _begin_new_map(self, agent_id: str) -> None:
-        """Merge the agent's map into its earlier one, then delete all its data. Raises StorageError.
+    @property
+    def has_background_work(self) -> bool:
+        """Whether `work_in_background` has something to do."""
+        return bool(self._leaving or self._renamed or self.keyframes.has_former)
 
-        Where both have a voxel, the one with the higher Σkappa is kept. After a crash in between, both names have the
-        same Gaussians, and the next call merges them again.
-        """
-        name, own = earlier_map_of(agent_id), self.maps.read(agent_id)
-        if own.counts.any():
-            seq = self.store.totals(name).highest_update_seq + 1
-            merged = fuse({agent_id: own, name: self.store.batch(name)}).batch
-            self.store.put(RoiSubset(name, "", seq, seq, merged))
-            self.frames.add_earlier(name, agent_id)
-            failed = self._record([(name, merged.keys)])
-            if name in failed:
-                raise failed[name]
-            _log.info("agent %s begins a new map; %d voxels of its earlier one are kept", agent_id, len(merged))
-        self._remove(agent_id)
+    def work_in_background(self) -> None:
+        """Delete a slice of what has been released, or publish names, as long as a message. Raises StorageError."""
+        with self._changing:
+            if self._renamed:
+                name, tiles = next(iter(self._renamed.items()))
+                self.maps.publish_name(name, tiles[-_PUBLISHED_TILES:])
+                del tiles[-_PUBLISHED_TILES:]
+                if not tiles:
+                    del self._renamed[name]
+                return
+            if self.keyframes.remove_next() or not self._leaving:
+                return
+            name = next(iter(self._leaving))
+            keys = self.store.remove_slice(name)
+            if len(keys):
+                self.maps.update({name: keys})
+                return
+            for part in (self.frames, self.store, self.maps):
+                part.remove_agent(name)
+            self._unrecorded.pop(name, None)
+            self._forget(name)
+            del self._leaving[name]
+            if agent_of(name) not in map(agent_of, self.members.sources):
+                self.store.end_epochs(agent_of(name))
 
-    def _drop_outgrown(self, agent_id: str) -> None:
-        """Delete the agent's earlier map if it wins no voxel."""
-        name = earlier_map_of(agent_id)
-        if self.store.totals(name).voxels and not self.maps.won_voxels(name):
-            try:
-                self._remove(name)
-            except StorageError as error:
-                # the updates are stored; the next one tries again
-                _log.warning("the earlier map of agent %s is not deleted: %s", agent_id, error)
+    def _begin_map(self, agent_id: str) -> None:
+        """Let the agent's present map become a former one, in constant time. Raises StorageError."""
+        former = self.maps.begin_map(agent_id, (ALIGNMENT,), (OBJECTS, ORDER_RECORD))
+        self.frames.begin_map(agent_id, former)
+        self.keyframes.begin_map(agent_id, former)
+        self.objects.remove_agent(agent_id)
+        self.traffic.remove_agent(agent_id)
+        if agent_id in self._unrecorded:
+            self._unrecorded[former] = self._unrecorded.pop(agent_id)
+        self._forget(agent_id)
+        if former in self.store.agents():
+            self._unobserved.add(former)
+            self._renamed[former] = self.maps.tiles(MapLayer.VOTE)[1].tolist()
+        else:
+            self.frames.remove_agent(former)
 
-    def _remove_all(self, agent_id: str) -> None:
-        """Delete all data of the agent, with its earlier map. Raises StorageError."""
-        self._remove(agent_id)
-        self._remove(earlier_map_of(agent_id))
-
-    def _remove(self, name: str) -> None:
-        """Delete all data of an agent, or an earlier map. Raises StorageError."""
-        for part in (self.frames, self.members.sessions, self._checks, self.traffic, self.keyframes, self.objects):
-            part.remove_agent(name)
-        self._unrecorded.pop(name, None)
+    def _forget(self, name: str) -> None:
+        self._unobserved.discard(name)
         if self._aligner is not None:
             self._aligner.forget(name)
-        # the store last: the parts wait for the end of what they write
-        self.maps.remove_agent(name, self.store.remove_agent(name))
+
+    def _release_former(self, agent_id: str) -> None:
+        """Release the agent's former maps that win no voxel or are not used, and the weakest of too many."""
+        won = {name: self.maps.won_voxels(name) for name in self._former(agent_id)}
+        strongest = sorted(won, key=lambda name: (-won[name], name))
+        for rank, name in enumerate(strongest):
+            if rank >= MAX_FORMER_MAPS or not won[name]:
+                self._release(name)
+
+    def _release(self, name: str) -> None:
+        """Let `work_in_background` delete a former map."""
+        self._leaving[name] = None
+        self._renamed.pop(name, None)
+
+    def _former(self, agent_id: str) -> list[str]:
+        return [name for name in self.store.agents() if name.startswith(f"{agent_id}:")]
+
+    def _remove_all(self, agent_id: str) -> None:
+        """Forget the agent, and release all its maps; `_remove_leaving` deletes them. Raises StorageError."""
+        self._begin_map(agent_id)
+        for name in self._former(agent_id):
+            self._release(name)
+        for part in (self.members.sessions, self._checks, self.store):
+            part.remove_agent(agent_id)
+        if not self._former(agent_id):
+            self.store.end_epochs(agent_id)
+
+    def _remove_leaving(self, agent_id: str) -> None:
+        while any(agent_id in (name, agent_of(name)) for name in list(self._leaving)):
+            self.work_in_background()
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         reports, (fused_voxels, fused_gaussians) = self.objects.reports(), self.maps.size()
+        names = sorted(self.members.sources - self._leaving.keys())
         return MissionStatus(
             mission_config=self.members.mission_config,
             revision=self.maps.revision(),
@@ -398,7 +485,7 @@ class FusionEngine:
             fused_voxels=fused_voxels,
             keyframes=len(self.keyframes),
             refined=self.maps.is_refined,
-            agents=tuple(self._contribution(name, reports.get(name)) for name in sorted(self.members.sources)),
+            agents=tuple(self._contribution(name, reports.get(name)) for name in names),
             banned_agents=self.members.bans.agents,
         )
 

@@ -11,7 +11,7 @@ import json
 import logging
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -53,7 +53,8 @@ class FrameFit:
 
     shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
     is_better: distance and colour improve by more than four times their uncertainty. is_apart: before the motion, the
-    surfaces are farther apart than those of maps in the same frame.
+    surfaces are farther apart than those of maps in the same frame. is_sure: with the motion, or as they are if it is
+    no better, the maps fit better than after any shift or turn.
     """
 
     motion: Float64[ndarray, "4 4"]
@@ -64,6 +65,7 @@ class FrameFit:
     compared: int
     is_better: bool
     is_apart: bool
+    is_sure: bool = False
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> FrameFit:
@@ -72,18 +74,26 @@ class FrameFit:
         return cls(**{**values, **misfits, "motion": np.array(values["motion"], np.float64).reshape(4, 4)})
 
 
+class Segment(NamedTuple):
+    """The motion of the updates from first_seq on. witnesses: the agents whose maps it was measured against."""
+
+    first_seq: int
+    T_fused_agent: Float64[ndarray, "4 4"]
+    witnesses: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameAlignment:
     """The state of one agent.
 
-    segments: (lowest update_seq, T_fused_agent), ascending. order: rank of its first update among the agents.
-    against: the agents that it contradicts. message: why it is corrected, quarantined or about to be. is_unknown: the
-    agent does not know its frame; `declared` is then what the server has found.
+    segments: ascending. order: rank of its first update among the agents. against: the agents that it contradicts.
+    message: why it is corrected, quarantined or about to be. is_unknown: the agent does not know its frame; its first
+    segment is what the server has found.
     """
 
     order: int
     state: AlignmentState = AlignmentState.UNKNOWN
-    segments: tuple[tuple[int, Float64[ndarray, "4 4"]], ...] = ()
+    segments: tuple[Segment, ...] = ()
     fit: FrameFit | None = None
     message: str = ""
     declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -93,12 +103,12 @@ class FrameAlignment:
     @property
     def T_fused_agent(self) -> Float64[ndarray, "4 4"]:  # noqa: N802 - a transform names both frames
         """The motion of the latest updates."""
-        return self.segments[-1][1] if self.segments else self.declared
+        return self.transform(len(self.segments) - 1)
 
     @property
     def is_identity(self) -> bool:
         """Return whether all updates are used as sent."""
-        return all(np.array_equal(T, np.eye(4)) for T in (self.declared, *(T for _, T in self.segments)))
+        return all(np.array_equal(T, np.eye(4)) for T in (self.declared, *(s.T_fused_agent for s in self.segments)))
 
     @property
     def is_used(self) -> bool:
@@ -112,12 +122,39 @@ class FrameAlignment:
 
     def is_placed_as(self, other: FrameAlignment) -> bool:
         """Return whether the vote reads the agent's updates in the same way with the other alignment."""
-        own, theirs = ((0, self.declared), *self.segments), ((0, other.declared), *other.segments)
+        own, theirs = ((Segment(0, placed.declared), *placed.segments) for placed in (self, other))
         return (
             self.is_used == other.is_used
             and len(own) == len(theirs)
-            and all(a == b and np.array_equal(T, U) for (a, T), (b, U) in zip(own, theirs, strict=True))
+            and all(a == b and np.array_equal(T, U) for (a, T, _), (b, U, _) in zip(own, theirs, strict=True))
         )
+
+    def continues(self, before: FrameAlignment) -> bool:
+        """Return whether it places the updates as before, but for newer ones in one more segment."""
+        known = before.segments[1 - len(self.segments) :]
+        return self.is_placed_as(before) or (
+            len(self.segments) > 1 and self.is_placed_as(replace(before, segments=(*known, self.segments[-1])))
+        )
+
+    def without(self, witness: str, is_gone: bool) -> FrameAlignment:
+        """Return the alignment without what was measured against an agent that is gone or elsewhere; itself without it.
+
+        A quarantine holds while one of those that the agent contradicts is there.
+        """
+        is_quarantined = self.state is AlignmentState.QUARANTINED
+        against = tuple(name for name in self.against if name != witness or not (is_gone and is_quarantined))
+        lost = [i for i, segment in enumerate(self.segments) if witness in segment.witnesses]
+        if not lost and against == self.against:
+            return self
+        segments = self.segments[: lost[0]] if lost else self.segments
+        if lost and segments:
+            # where the updates from here on were measured, they are measured again
+            segments += (segments[-1]._replace(first_seq=self.segments[lost[0]].first_seq),)
+        if lost and self.is_unknown and not segments:
+            return self.unlocalised(f"it was found by the map of {witness}")
+        is_kept = against if is_quarantined else segments
+        state, message = (self.state, self.message) if is_kept else (AlignmentState.UNKNOWN, "")
+        return replace(self, segments=segments, against=against, fit=None, state=state, message=message)
 
     @property
     def rank(self) -> tuple[bool, int]:
@@ -126,12 +163,12 @@ class FrameAlignment:
 
     def segment_of(self, update_seqs: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
         """Return the index of each update's segment; -1 for updates before the first, which use the declared motion."""
-        firsts = np.array([first for first, _ in self.segments], np.int64)
+        firsts = np.array([segment.first_seq for segment in self.segments], np.int64)
         return np.searchsorted(firsts, update_seqs, side="right") - 1
 
     def transform(self, segment: int) -> Float64[ndarray, "4 4"]:
         """Return T_fused_agent of a segment."""
-        return self.declared if segment < 0 else self.segments[segment][1]
+        return self.declared if segment < 0 else self.segments[segment].T_fused_agent
 
     def unlocalised(self, reason: str) -> FrameAlignment:
         """Return the alignment of an agent whose frame nobody knows; reason: why not."""
@@ -173,13 +210,11 @@ class FrameAlignments:
         self._save(agent_id, self._next_id, alignment)
         self._next_id += 1
 
-    def add_earlier(self, name: str, agent_id: str) -> None:
-        """Set the alignment of the agent's earlier map, which is in the fused frame. Raises StorageError."""
-        if name not in self._frames:
-            own = self.get(agent_id)
-            is_reference = own.state is AlignmentState.REFERENCE
-            state = AlignmentState.REFERENCE if is_reference else AlignmentState.ALIGNED
-            self.add(name, FrameAlignment(own.order, state, is_unknown=own.is_unknown))
+    def begin_map(self, agent_id: str, former: str) -> None:
+        """Let the agent's alignment stay with its former map; the store has moved its record."""
+        self._frames = {former if name == agent_id else name: own for name, own in self._frames.items()}
+        self._contributors = {former if name == agent_id else name for name in self._contributors}
+        self.unmoved = frozenset(former if name == agent_id else name for name in self.unmoved)
 
     def contribute(self, agent_id: str) -> None:
         """Note an update of the agent: its first one fixes its rank. Raises StorageError.
@@ -197,7 +232,8 @@ class FrameAlignments:
     def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> bool:
         """Set the motion that the agent declares, None if it does not know its frame. Raises StorageError.
 
-        Returns whether the motion changed; what was found of an unknown frame stays.
+        Returns whether the motion changed; what was found of an unknown frame stays. The same motion again takes back
+        its corrections. A quarantine stays until the maps agree.
         """
         current = self.get(agent_id)
         if T_fused_agent is None:
@@ -205,8 +241,10 @@ class FrameAlignments:
                 return False
             trusts = "this server compares no frames (frame-alignment = trust, or no plug-in)"
             declared = current.unlocalised("" if self.are_compared else trusts)
-        elif current.is_unknown or not np.array_equal(current.declared, T_fused_agent):
+        elif current.is_unknown or current.segments or not np.array_equal(current.declared, T_fused_agent):
             declared = FrameAlignment(current.order, declared=T_fused_agent)
+            if current.state is AlignmentState.QUARANTINED:
+                declared = replace(current, declared=T_fused_agent, segments=())
         else:
             return False
         self.add(agent_id, declared)
@@ -233,10 +271,14 @@ class FrameAlignments:
         return agent_id in self._frames and self._frames[agent_id][0] == frame_id
 
     def remove_agent(self, agent_id: str) -> None:
-        """Delete the alignment of the agent; the store deletes its record with its updates."""
+        """Delete the alignment of the agent, and what was measured against it. Raises StorageError.
+
+        The store deletes its record with its updates.
+        """
         self._frames = {name: own for name, own in self._frames.items() if name != agent_id}
         self._contributors.discard(agent_id)
         self.unmoved -= {agent_id}
+        self._take_back(agent_id, is_gone=True)
 
     def transforms(self) -> dict[str, Float64[ndarray, "4 4"]]:
         """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
@@ -262,8 +304,21 @@ class FrameAlignments:
                     self.unmoved |= {name}
 
     def _save(self, agent_id: str, frame_id: int, alignment: FrameAlignment) -> None:
+        before = self.get(agent_id)
         self._store.save_record(agent_id, RECORD, json.dumps(asdict(alignment), default=np.ndarray.tolist).encode())
         self._frames = {**self._frames, agent_id: (frame_id, alignment)}
+        if not alignment.continues(before):
+            self._take_back(agent_id, is_gone=False)
+
+    def _take_back(self, witness: str, is_gone: bool) -> None:
+        """Take back what was measured against this agent, then what was measured against those that this moves."""
+        for name in list(self._frames):
+            before = self.get(name)
+            after = before.without(witness, is_gone)
+            if after is not before:
+                _log.info("agent %s: %s is %s, so it is measured again", name, witness, "gone" if is_gone else "moved")
+                self.add(name, after)
+                self.unmoved |= {name}
 
 
 def _decode(data: bytes) -> FrameAlignment:
@@ -274,7 +329,9 @@ def _decode(data: bytes) -> FrameAlignment:
         plain = {
             **values,
             "state": AlignmentState(values["state"]),
-            "segments": tuple((int(first), _matrix(T)) for first, T in values["segments"]),
+            "segments": tuple(
+                Segment(int(own[0]), _matrix(own[1]), *map(tuple, own[2:])) for own in values["segments"]
+            ),
             "fit": None if fit is None else FrameFit.from_json(fit),
             "declared": _matrix(values["declared"]),
             "against": tuple(map(str, values["against"])),

@@ -172,11 +172,11 @@ class FusedMapLayers:
         self._voted_log = self._refined_log = self._change_log.voxels
         if stored is not None:
             self._refined_log = VoxelLog(first_revision, max_removed_voxels)
-            self._refined_log.record(self._restore_refined(stored, vote).tolist())
+            self._refined_log.record(self._restore_refined(stored, vote), np.zeros(0, np.int64))
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
         """Return the layer's revision; it increases with every change. It does not wait for the lock."""
-        return self._log_of(layer).revisions.revision
+        return self._log_of(layer).revision
 
     def size(self) -> tuple[int, int]:
         """Return the number of voxels and of Gaussians of the vote."""
@@ -225,10 +225,26 @@ class FusedMapLayers:
         with self._lock:
             return self._votes.batch(agent_id)
 
-    def remove_agent(self, agent_id: str, removed: Int64[ndarray, " v"]) -> None:
-        """Vote without an agent; removed: the voxels that the store had of it."""
+    def begin_map(self, agent_id: str, moved: Sequence[str], dropped: Sequence[str]) -> str:
+        """Begin another map of an agent; as FusionStore.begin_map. Raises StorageError."""
         with self._lock:
-            self._record({agent_id: np.union1d(removed, self._votes.remove_agent(agent_id))})
+            former = self._votes.begin_map(agent_id, moved, dropped)
+            self._change_log.rename(agent_id, former)
+            return former
+
+    def publish_name(self, name: str, tiles: Sequence[int]) -> None:
+        """Record the voxels that a map with a new name wins in these tiles as changed, for the watchers."""
+        with self._lock:
+            for tile in tiles:
+                keys = self._change_log.winners(self._voted_log.keys(tile)).get(name, np.zeros(0, np.int64))
+                for log in dict.fromkeys((self._voted_log, self._refined_log)):
+                    log.touch(keys)
+
+    def remove_agent(self, name: str) -> None:
+        """Vote without a map, of which the store has nothing any more."""
+        with self._lock:
+            self._record({name: self._votes.remove_agent(name)})
+            self._change_log.forget(name)
 
     def _record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
         """Record that what the vote reads changed in these voxels of each agent, with one vote on all of them."""
@@ -237,19 +253,18 @@ class FusedMapLayers:
         vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
         fused_changes = self._change_log.record(changed_keys, vote)
         if self._refined is not None:
-            present = set(vote.keys.tolist())
-            changed = [key for key in fused_changes.tolist() if key in present]
-            removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_log]
-            self._refined_log.record(changed, removed)
+            is_present = np.isin(fused_changes, vote.keys)
+            was_present = self._refined_log.find(fused_changes)["revisions"] > 0
+            self._refined_log.record(fused_changes[is_present], fused_changes[~is_present & was_present])
 
     def changes(self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE) -> FusedMapChanges:
         """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError."""
         with self._lock:
             log = self._log_of(layer)
-            keys = log.revisions.changed_since(since_revision) if since_revision else log.all_keys()
+            keys = log.changed_since(since_revision) if since_revision else log.all_keys()
             won = self._won_voxels(layer, keys)
             removed = np.setdiff1d(keys, won.batch.keys) if since_revision else np.zeros(0, np.int64)
-            return FusedMapChanges(log.revisions.revision, won, removed)
+            return FusedMapChanges(log.revision, won, removed)
 
     def voted_map(self, only_agent: str = "") -> VoxelBatch:
         """Return the fused map, or its voxels that one agent wins."""
@@ -277,7 +292,7 @@ class FusedMapLayers:
         for key, tile in zip(refined.batch.keys.tolist(), tiles_of(refined.batch.keys).tolist(), strict=True):
             own.setdefault(tile, set()).add(key)
         with self._lock:
-            revisions = self._voted_log.revisions
+            revisions = self._voted_log
             changed = set(revisions.changed_since(revision).tolist())
             if self._refined is None:
                 self._refined_log = self._voted_log.copy()
@@ -299,7 +314,7 @@ class FusedMapLayers:
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels of the vote that changed or became empty after this revision. Raises RevisionGoneError."""
         with self._lock:
-            return self._voted_log.revisions.changed_since(revision)
+            return self._voted_log.changed_since(revision)
 
     def refined_map(self) -> VoxelBatch:
         """Return the refined map, with the newer vote in changed voxels. Raises MismatchError before a refinement."""
@@ -334,29 +349,28 @@ class FusedMapLayers:
         parts = []
         refined = self._refined if layer is MapLayer.REFINED else None
         if refined is not None:
-            changed_at = self._voted_log.revisions.changed_at
-            voted = np.array([key for key in keys.tolist() if changed_at(key) > refined.revision], np.int64)
+            voted = keys[self._voted_log.find(keys)["revisions"] > refined.revision]
             parts.append(select_keys(refined.batch, np.setdiff1d(keys, voted)))
-        winners = self._change_log.winners(voted.tolist())
-        parts += [self._votes.batch(name, np.array(own, np.int64)) for name, own in winners.items()]
+        parts += [self._votes.batch(name, own) for name, own in self._change_log.winners(voted).items()]
         batch = reduce(merge_batches, parts, empty_batch())
         # a commit may have stored a tombstone that is not recorded yet; it follows as a change
         batch = select_voxels(batch, batch.counts > 0)
-        winners = self._change_log.winners(batch.keys.tolist())
-        return WonVoxels(batch, winners)
+        winners = self._change_log.winners(batch.keys)
+        return WonVoxels(batch, {name: own.tolist() for name, own in winners.items()})
 
     def _restore_refined(self, stored: StoredRefinement, vote: VoteResult) -> Int64[ndarray, " k"]:
         """Show a refinement from before a restart; returns the voxels of the refined layer."""
         changed = stored.changed_voxels(vote)
-        self._refined = RefinedMap(stored.without_removed(vote), self._voted_log.revisions.revision)
+        self._refined = RefinedMap(stored.without_removed(vote), self._voted_log.revision)
         # a later revision than the refinement's: these voxels show the vote
-        self._voted_log.record(changed.tolist())
+        self._voted_log.touch(changed)
         return np.union1d(self._refined.batch.keys, changed)
 
     def _show_tile(self, tile: int, refined: set[int], changed: set[int]) -> None:
         """Record a tile of the refined layer; changed: the voxels that show the vote."""
         before = set(self._refined_log.keys(tile).tolist())
-        self._refined_log.record(sorted(refined - changed), sorted(before - refined - changed))
+        shown, removed = sorted(refined - changed), sorted(before - refined - changed)
+        self._refined_log.record(np.array(shown, np.int64), np.array(removed, np.int64))
 
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._votes.agents()

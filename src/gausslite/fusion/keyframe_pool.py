@@ -15,6 +15,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame
+from gausslite.fusion.epochs import is_former
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore
 
@@ -68,7 +69,10 @@ class KeyframePool:
         self._changing = Lock()
         store.remove_unfinished_keyframes()
         self._ids = itertools.count()
-        self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD), self._ids)
+        sizes_bytes = store.keyframe_sizes()
+        # of maps that are not the agents' present ones
+        self._former = {name: list(sizes_bytes.pop(name)) for name in filter(is_former, list(sizes_bytes))}
+        self._stored = _in_order(sizes_bytes, store.records(ORDER_RECORD), self._ids)
 
     def __len__(self) -> int:
         return sum(map(len, list(self._stored.values())))
@@ -81,7 +85,7 @@ class KeyframePool:
         """
         self._quotas.require_keyframe(keyframe.index, keyframe.pixels, len(keyframe.data))
         with self._changing:
-            # from here on, `remove_agent` waits
+            # from here on, `begin_map` waits
             stored = dict(self._stored.setdefault(keyframe.agent_id, {}))
             self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data, session_id)
             before = stored.get(keyframe.index)
@@ -121,11 +125,28 @@ class KeyframePool:
             raise InvalidInputError(f"index: expected a keyframe of {agent_id}, such as {newest}, got {index}")
         return self._store.keyframe(agent_id, newest if index is None else index)
 
-    def remove_agent(self, agent_id: str) -> None:
-        """Delete an agent's keyframes, also the one that is being written."""
+    def begin_map(self, agent_id: str, former: str) -> None:
+        """Drop the agent's keyframes, also the one that is being written; `remove_next` deletes them."""
         if agent_id in self._stored:
             with self._changing:
-                self._store.remove_keyframes(agent_id, sorted(self._stored.pop(agent_id, ())))
+                self._former[former] = list(self._stored.pop(agent_id, ()))
+
+    @property
+    def has_former(self) -> bool:
+        """Whether `remove_next` has something to delete."""
+        return bool(self._former)
+
+    def remove_next(self) -> bool:
+        """Delete a keyframe of a former map; returns whether there was one. Raises StorageError."""
+        with self._changing:
+            if not self._former:
+                return False
+            former, indices = next(iter(self._former.items()))
+            self._store.remove_keyframes(former, indices[:1])
+            del indices[:1]
+            if not indices:
+                del self._former[former]
+            return True
 
     def _newest_within_limits(self, stored: dict[int, _Stored]) -> dict[int, _Stored]:
         """Return the keyframes received last that are within the limits together, in their order."""

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import os
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 
 from gausslite.config.option import option
 from gausslite.config.values import VOXEL_SIZE
@@ -15,6 +19,7 @@ DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/channel.py."""
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
+_CONTAINER_LIMITS = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _DEFAULT_MISSION_ID, _DEFAULT_WORLD_FRAME = "mission", "world"
 
 
@@ -98,11 +103,22 @@ class Quotas:
                 raise QuotaError(f"keyframe {index}: expected at most {limit} {unit}, got {value}")
 
 
+@functools.cache
+def _half_of_memory() -> int:
+    """Return half of the memory that the container may have, or of the machine's."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for path in _CONTAINER_LIMITS:
+        with contextlib.suppress(OSError, ValueError):
+            # "max" without a limit
+            limits.append(int(path.read_text()))
+    return min(limits) // 2
+
+
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
-    max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
+    max_removed_voxels: number of removed voxels that a watcher can still catch up with; see VoxelLog.
     lease_s: time after an agent's last call during which no other robot can take its name.
     """
 
@@ -110,6 +126,16 @@ class FusionSettings:
     mission_id: str = option("", "the mission to serve (default: the first agent's)", key="mission", metavar="ID")
     world_frame: str = option("", "frame of all maps (default: the first agent's)", metavar="NAME")
     quotas: Quotas = field(default_factory=Quotas)
+    memory_bytes: int = option(
+        0,
+        "memory for the voxels of all agents, in equal shares (default: half of the container's, or the machine's)",
+        key="memory-mb",
+        unit="MiB",
+        low=0,
+        high=1 << 24,
+        convert=lambda mebibytes: mebibytes << 20,
+        to_plain=lambda size: size >> 20,
+    )
     max_removed_voxels: int = MAX_REMOVED_VOXELS
     lease_s: float = DEFAULT_LEASE_S
 
@@ -117,6 +143,11 @@ class FusionSettings:
         if self.mission_id:
             require_identifier("mission", self.mission_id)
         require_name("world frame", self.world_frame)
+
+    @property
+    def agent_bytes(self) -> int:
+        """The memory that the voxels of one agent may take."""
+        return (self.memory_bytes or _half_of_memory()) // self.quotas.agents
 
     @property
     def mission_config(self) -> MissionConfig:

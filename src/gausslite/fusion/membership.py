@@ -12,7 +12,7 @@ from threading import Lock
 
 from gausslite.domain import errors
 from gausslite.domain.checks import quote_name, require_identifier
-from gausslite.fusion.earlier_map import is_earlier_map
+from gausslite.fusion.epochs import agent_of
 from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord, reconcile
 from gausslite.fusion.store import FusionStore
 
@@ -222,7 +222,7 @@ class Membership:
 
     @property
     def sources(self) -> frozenset[str]:
-        """The agents with a session or with data, and the names of earlier maps."""
+        """The agents with a session or with data, and the names of former maps."""
         return self.sessions.agents | frozenset(self._store.agents())
 
     def admit(self, agent_id: str, requested: MissionConfig, token: str) -> list[str]:
@@ -281,4 +281,4 @@ class Membership:
         return ended
 
     def _agents(self) -> frozenset[str]:
-        return frozenset(name for name in self.sources if not is_earlier_map(name))
+        return frozenset(map(agent_of, self.sources))

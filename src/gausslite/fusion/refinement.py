@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.config.option import option
@@ -32,6 +32,7 @@ from gausslite.render.rasterizer import (
     AdamSettings,
     LossWeights,
     Rasterizer,
+    Rendering,
     TrainingView,
     UpdateCounter,
     gaussians_to_rows,
@@ -204,18 +205,6 @@ def _extent_m(gaussians: Gaussians) -> float:
     return max(0.01, float(np.quantile(distance_m, 0.95)))
 
 
-_MAX_VIEW_PX = 1920 * 1080
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LayerView:
-    """A rendering of a map layer; depth is 0 where the map is not opaque. revision: of the rendered layer."""
-
-    rgb: UInt8[ndarray, "h w 3"]
-    depth_m: Float32[ndarray, "h w"]
-    revision: int
-
-
 class _LayerCopy:
     """The rows of a map layer, brought up to date tile by tile, so that the map is held for one tile at a time."""
 
@@ -251,19 +240,14 @@ class MapRenderer:
         self._rasterizer: Rasterizer | None = None
         self._copies: dict[MapLayer, _LayerCopy] = {}
 
-    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
-        """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
-        pixels = camera.width_px * camera.height_px
-        if pixels > _MAX_VIEW_PX:
-            raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer
+    ) -> tuple[Rendering | None, int]:
+        """Return a view of a layer, None of an empty one, and the layer's revision. Raises KernelError."""
         copy = self._copies.setdefault(layer, _LayerCopy())
         revision = copy.update(self._maps, layer)
-        size = camera.height_px, camera.width_px
-        rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
-        if len(copy.rows):
-            if self._rasterizer is None:
-                self._rasterizer = self._create_rasterizer()
-            rendering = self._rasterizer.forward(copy.rows, camera, inverse(T_world_camera))
-            rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
-            depth_m = rendering.expected_depth_m()
-        return LayerView(rgb, depth_m, revision)
+        if not len(copy.rows):
+            return None, revision
+        if self._rasterizer is None:
+            self._rasterizer = self._create_rasterizer()
+        return self._rasterizer.forward(copy.rows, camera, inverse(T_world_camera)), revision

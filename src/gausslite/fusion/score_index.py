@@ -1,4 +1,4 @@
-"""Index the totals of every update in memory by agent and voxel, so that a message costs its own size, not the map's.
+"""Index the totals of every update in memory by map and voxel, so that a message costs its own size, not the map's.
 
 The index is derived from the rows of a store. The store owns it, and changes it after a commit.
 """
@@ -6,11 +6,9 @@ The index is derived from the rows of a store. The store owns it, and changes it
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import reduce
-from itertools import repeat
-from operator import or_
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,16 +17,22 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec.encoded_voxels import RECORD, EncodedSubset, EncodedVoxels, join_elements, to_records
-from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import VoxelBatch
+from gausslite.domain.voxel_changes import TileDigests, hash_columns
+from gausslite.domain.voxels import VoxelBatch, tiles_of
+from gausslite.fusion.tile_tables import Table, by_tile, find, joined, keys_of, offsets_of, replaced
 
-SCORES = np.dtype([("keys", "i8"), ("update_seqs", "i8"), ("kappa_sums", "u8"), ("counts", "u4"), ("rows", "i8")])
+_COLUMNS = [("update_seqs", "i8"), ("kappa_sums", "u8"), ("counts", "u4"), ("rows", "i8")]
+SCORES = np.dtype([("keys", "i8"), *_COLUMNS])
 Scores = NDArray[Any]
 """An element of SCORES for each of an agent's updates: its totals, and the store's row that has its Gaussians.
 
 update_seq and row are -1 where the agent has no update of a voxel.
 """
 NO_SCORES: Scores = np.zeros(0, SCORES)
+VOXEL_BYTES, TILE_BYTES = 50, 900
+"""What a voxel, and each map's tile with voxels, take in memory here and in the change log; measured."""
+VOXEL_UNITS = 2
+"""The size of a voxel beside its Gaussians, in Gaussians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +64,7 @@ class AgentTotals:
     kappa_sum: int = 0
     highest_update_seq: int = 0
 
-    def replace_part(self, removed: Scores, added: Scores) -> AgentTotals:
+    def replace_part(self, removed: Table, added: Table) -> AgentTotals:
         """Return the totals after `added` replaced `removed`."""
         counts, counts_before = added["counts"], removed["counts"]
         return AgentTotals(
@@ -77,79 +81,161 @@ def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
     return sum(values.tolist())
 
 
-_FIRST_CAPACITY = 64
-_MISSING = np.zeros((), SCORES)
+_PACKED = np.dtype([("offsets", "u2"), *_COLUMNS])
+_NO_TABLE: Table = np.zeros(0, _PACKED)
+_MISSING = np.zeros((), _PACKED)
 _MISSING["update_seqs"] = _MISSING["rows"] = -1
+_MODULUS = 1 << 64
 ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[EncodedVoxels]]
 """Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
 
+@dataclass(slots=True, eq=False)
+class MapTile:
+    """A map's part in a tile. written, used: the size of its rows, and of its voxels in them, in Gaussians."""
+
+    table: Table = field(default_factory=lambda: _NO_TABLE)
+    rows: array[int] = field(default_factory=lambda: array("q"))
+    written: int = 0
+    used: int = 0
+    digest: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Map:
+    tiles: dict[int, MapTile] = field(default_factory=dict)
+    totals: AgentTotals = field(default_factory=AgentTotals)
+
+
+_NO_MAP = _Map()
+
+
 class ScoreIndex:
-    """Totals by agent and voxel: 36 bytes a row and two dictionary entries. Not thread-safe; the store holds a lock."""
+    """Totals by map and voxel, 30 bytes each. Not thread-safe; the store holds a lock."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, _AgentRows] = {}
+        self._maps: dict[str, _Map] = {}
         self.agents: tuple[str, ...] = ()
-        """The ids of the agents with rows, sorted."""
-        # for each voxel a bit set of the agents with a row, so that a look-up asks only these agents
-        self._holders: dict[int, int] = {}
-        self._bits: dict[str, int] = {}
+        """The names of the maps with rows, sorted."""
 
-    def totals(self, agent_id: str) -> AgentTotals:
-        """Return the sums over an agent's rows; zero for an unknown one."""
-        return self._rows.get(agent_id, _NO_ROWS).totals
+    def totals(self, name: str) -> AgentTotals:
+        """Return the sums over a map's rows; zero for an unknown one."""
+        return self._maps.get(name, _NO_MAP).totals
 
-    def digests(self, agent_id: str) -> TileDigests:
-        """Return the digests of an agent's rows; empty for an unknown one."""
-        scores = self.sorted_scores(agent_id)
-        return TileDigests.of(scores["keys"], scores["update_seqs"])
+    def tiles(self, name: str) -> dict[int, MapTile]:
+        """Return the tiles of a map; empty for an unknown one."""
+        return self._maps.get(name, _NO_MAP).tiles
 
-    def scores_of(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
-        """Return the agent's totals on these voxels, in their order."""
-        rows = self._rows.get(agent_id, _NO_ROWS)
-        return rows.stored(rows.find(keys))
+    def tile(self, name: str, tile: int) -> MapTile:
+        """Return a tile of a map; both exist from then on."""
+        if name not in self._maps:
+            self._maps[name] = _Map()
+            self.agents = tuple(sorted(self._maps))
+        tiles = self._maps[name].tiles
+        if tile not in tiles:
+            tiles[tile] = MapTile()
+        return tiles[tile]
+
+    def memory_bytes(self, names: Iterable[str], name: str, added: Int64[ndarray, " k"]) -> int:
+        """Return the memory that these maps take in the index and the change log, with voxels added to one, at most."""
+        tiles = len(set(tiles_of(added).tolist()) - self.tiles(name).keys())
+        maps = [self._maps[own] for own in names]
+        voxels = sum(own.totals.voxels for own in maps)
+        return VOXEL_BYTES * (len(added) + voxels) + TILE_BYTES * (tiles + sum(len(own.tiles) for own in maps))
+
+    def digests(self, name: str) -> TileDigests:
+        """Return the digests of a map's rows, which are kept with each change; empty for an unknown one."""
+        tiles = self.tiles(name)
+        names = np.fromiter(tiles, np.int64, len(tiles))
+        hashes = np.fromiter((tile.digest for tile in tiles.values()), np.uint64, len(tiles))
+        order = np.argsort(names)
+        return TileDigests(names[order], hashes[order])
+
+    def scores_of(self, name: str, keys: Int64[ndarray, " k"]) -> Scores:
+        """Return the map's totals on these voxels, in their order."""
+        found = self._stored(name, keys)
+        return _scores(keys, found)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
-        """Return all agents' totals on these voxels, or on all."""
+        """Return the totals of all maps on these voxels, or on all."""
         wanted = None if keys is None else np.unique(keys)
-        holders = -1 if wanted is None else reduce(or_, map(self._holders.get, wanted.tolist(), repeat(0)), 0)
-        present = [index for index, agent_id in enumerate(self.agents) if self._bits[agent_id] & holders]
-        parts = [self._rows[self.agents[index]].sorted_scores(wanted) for index in present]
+        tiles = set(tiles_of(wanted).tolist()) if wanted is not None else None
+        present = [
+            index for index, name in enumerate(self.agents) if tiles is None or not tiles.isdisjoint(self.tiles(name))
+        ]
+        parts = [self.sorted_scores(self.agents[index], wanted) for index in present]
         agent_index = np.repeat(np.array(present, np.int32), [len(part) for part in parts])
         return VoxelScoreTable(self.agents, agent_index, join_elements([NO_SCORES, *parts]))
 
-    def sorted_scores(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
-        """Return the agent's totals on those of these voxels (ascending keys) that it has, or on all."""
-        return self._rows.get(agent_id, _NO_ROWS).sorted_scores(keys)
+    def sorted_scores(self, name: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
+        """Return the map's totals on those of these voxels (ascending keys) that it has, or on all."""
+        if keys is not None:
+            found = self._stored(name, keys)
+            present = found["rows"] >= 0
+            return _scores(keys[present], found[present])
+        tiles = self.tiles(name)
+        tables = [tile.table for tile in tiles.values()]
+        scores = _scores(keys_of(list(tiles), tables), joined(tables, _PACKED))
+        return scores.take(np.argsort(scores["keys"]))
 
-    def put(self, agent_id: str, scores: Scores) -> Scores:
-        """Replace the agent's totals on the voxels of the scores; returns those from before."""
-        if agent_id not in self._rows:
-            self._rows[agent_id] = _AgentRows()
-            self.agents = tuple(sorted(self._rows))
-            used = reduce(or_, self._bits.values(), 0)
-            self._bits[agent_id] = ~used & (used + 1)
-        bit = self._bits[agent_id]
-        new_keys, before = self._rows[agent_id].put(scores)
-        for key in new_keys:
-            self._holders[key] = self._holders.get(key, 0) | bit
-        return before
+    def put(self, name: str, scores: Scores) -> None:
+        """Replace the map's totals on the voxels of the scores."""
+        scores = scores.take(np.argsort(scores["keys"], kind="stable"))
+        keys, added = np.ascontiguousarray(scores["keys"]), np.empty(len(scores), _PACKED)
+        added["offsets"] = offsets_of(keys)
+        for column, _ in _COLUMNS:
+            added[column] = scores[column]
+        before = self._stored(name, keys)
+        self._replace(name, keys, before, added)
 
-    def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's rows; returns the keys of its voxels, ascending."""
-        rows = self._rows.pop(agent_id, None)
-        if rows is None:
-            return np.zeros(0, np.int64)
-        self.agents = tuple(sorted(self._rows))
-        bit = self._bits.pop(agent_id)
-        keys = rows.sorted_scores(None)["keys"].copy()
-        for key in keys.tolist():
-            left = self._holders[key] & ~bit
-            if left:
-                self._holders[key] = left
-            else:
-                del self._holders[key]
-        return keys
+    def remove_tiles(self, name: str, tiles: Iterable[int]) -> Int64[ndarray, " v"]:
+        """Delete the map's rows in these tiles; returns the keys of their voxels. A map without tiles is unknown."""
+        own = self._maps.get(name, _NO_MAP)
+        removed = {tile: own.tiles.pop(tile).table for tile in tiles}
+        own.totals = own.totals.replace_part(joined(removed.values(), _PACKED), _NO_TABLE)
+        if name in self._maps and not own.tiles:
+            del self._maps[name]
+            self.agents = tuple(sorted(self._maps))
+        return np.sort(keys_of(list(removed), list(removed.values())))
+
+    def rename(self, name: str, other: str) -> None:
+        """Give a map another name, if it exists."""
+        if name in self._maps:
+            self._maps[other] = self._maps.pop(name)
+            self.agents = tuple(sorted(self._maps))
+
+    def _stored(self, name: str, keys: Int64[ndarray, " k"]) -> Table:
+        """Return the map's elements on these voxels, in their order; _MISSING where it has none."""
+        found, offsets, tiles = np.full(len(keys), _MISSING), offsets_of(keys), self.tiles(name)
+        for tile, places in by_tile(keys) if tiles else ():
+            own = tiles.get(tile)
+            if own is not None:
+                at = find(own.table, offsets[places])
+                found[places[at >= 0]] = own.table.take(at[at >= 0])
+        return found
+
+    def _replace(self, name: str, keys: Int64[ndarray, " k"], before: Table, added: Table) -> None:
+        """Put these elements in the place of those from before, and follow with the sums of map and tiles."""
+        was_there = before["rows"] >= 0
+        sizes = added["counts"].astype(np.int64) + VOXEL_UNITS
+        sizes -= np.where(was_there, before["counts"].astype(np.int64) + VOXEL_UNITS, 0)
+        hashes = hash_columns(keys, added["update_seqs"])
+        hashes -= np.where(was_there, hash_columns(keys, before["update_seqs"]), np.uint64(0))
+        for number, places in by_tile(keys):
+            tile, part = self.tile(name, number), added.take(places)
+            tile.table = replaced(tile.table, find(tile.table, part["offsets"]) if len(tile.table) else places, part)
+            tile.used += int(sizes[places].sum())
+            tile.digest = (tile.digest + int(hashes[places].sum())) % _MODULUS
+        own = self._maps[name]
+        own.totals = own.totals.replace_part(before, added)
+
+
+def _scores(keys: Int64[ndarray, " k"], packed: Table) -> Scores:
+    scores = np.empty(len(keys), SCORES)
+    scores["keys"] = keys
+    for column, _ in _COLUMNS:
+        scores[column] = packed[column]
+    return scores
 
 
 def newer_voxels(index: ScoreIndex, update: EncodedSubset, read: ReadVoxels) -> Bool[ndarray, " v"]:
@@ -187,56 +273,3 @@ def voxel_records(batch: VoxelBatch) -> list[bytes]:
     data = to_records(batch.gaussians).tobytes()
     ends = (batch.offsets * RECORD.itemsize).tolist()
     return [data[start:end] for start, end in itertools.pairwise(ends)]
-
-
-class _AgentRows:
-    """One agent's totals, in the order of arrival, and the row of each voxel among them."""
-
-    def __init__(self) -> None:
-        self.totals = AgentTotals()
-        self._row_of: dict[int, int] = {}
-        self._scores: Scores = np.zeros(_FIRST_CAPACITY, SCORES)
-
-    def find(self, keys: Int64[ndarray, " k"]) -> Int64[ndarray, " k"]:
-        """Return the row of each voxel, -1 where there is none."""
-        return np.fromiter(map(self._row_of.get, keys.tolist(), repeat(-1)), np.int64, len(keys))
-
-    def stored(self, rows: Int64[ndarray, " k"]) -> Scores:
-        """Return the totals in these rows."""
-        # `take` copies elements as they are, an index copies them field by field
-        found = self._scores.take(rows)
-        found[rows < 0] = _MISSING
-        return found
-
-    def sorted_scores(self, wanted: Int64[ndarray, " k"] | None) -> Scores:
-        """Return the totals of the wanted voxels (ascending keys), or of all."""
-        if wanted is None:
-            rows = np.argsort(self._scores["keys"][: len(self._row_of)])
-        else:
-            rows = self.find(wanted)
-            rows = rows[rows >= 0]
-        return self._scores.take(rows)
-
-    def put(self, scores: Scores) -> tuple[list[int], Scores]:
-        """Replace the totals of the voxels of the scores; returns the keys that had none, and those from before."""
-        keys = scores["keys"]
-        rows = self.find(keys)
-        before = self.stored(rows)
-        is_new = rows < 0
-        new_keys: list[int] = keys[is_new].tolist()
-        used = len(self._row_of)
-        rows[is_new] = np.arange(used, used + len(new_keys))
-        self._reserve(used + len(new_keys))
-        self._row_of.update(zip(new_keys, range(used, used + len(new_keys)), strict=True))
-        self._scores[rows] = scores
-        self.totals = self.totals.replace_part(before, scores)
-        return new_keys, before
-
-    def _reserve(self, size: int) -> None:
-        capacity = len(self._scores)
-        if size > capacity:
-            extra = max(size, 2 * capacity) - capacity
-            self._scores = np.concatenate([self._scores, np.zeros(extra, SCORES)])
-
-
-_NO_ROWS = _AgentRows()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import logging
 import secrets
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,16 +14,22 @@ from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
 
+from gausslite.codec.commit_head import COUNT_COMMIT, CommitHead
 from gausslite.domain.errors import StorageError
+from gausslite.fusion.epochs import RECORD as EPOCH
+from gausslite.fusion.migrations import Query, missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
+
+_ROW_SUM = "(SELECT coalesce(sum(number), 0) FROM voxel_updates)"
+_log = logging.getLogger(__name__)
 
 IN_MEMORY = Path(":memory:")
 """The name of a database that ends with its connection."""
 SCHEMA_VERSION = 9
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
-    "restore a backup (gausslite-fusion-server restore BACKUP STORE), or delete the damaged rows "
+    "restore a backup (gausslite-fusion-server restore BACKUP STORE), or keep what is intact "
     "(gausslite-fusion-server verify --repair STORE), and the agents send again what is missing"
 )
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
@@ -62,8 +69,11 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def open_existing(path: Path) -> sqlite3.Connection:
-    """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError."""
+def open_existing(path: Path, may_be_earlier: bool = False) -> sqlite3.Connection:
+    """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError.
+
+    may_be_earlier: of one of the schemas that `bring_forward` knows.
+    """
     if not path.is_file():
         raise StorageError(f"store {path}: expected a GaussLite store, got no file")
     with ExitStack() as opened, storage_errors(path):
@@ -75,14 +85,64 @@ def open_existing(path: Path) -> sqlite3.Connection:
             )
         if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
             raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
-        version = db.execute("PRAGMA user_version").fetchone()[0]
-        if version != SCHEMA_VERSION:
-            raise StorageError(
-                f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use that "
-                "release, or another file, and the agents send their updates again"
-            )
+        if _steps(db, path) and not may_be_earlier:
+            raise StorageError(f"store {path}: of an earlier schema; a server that opens it brings it forward")
         opened.pop_all()
         return db
+
+
+def bring_forward(db: sqlite3.Connection, path: Path) -> None:
+    """Give a store of an earlier schema the tables of this one, in one transaction. Raises StorageError."""
+    with storage_errors(path):
+        db.execute("BEGIN IMMEDIATE")
+        for step in _steps(db, path):
+            step(db.execute)
+        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        db.execute("COMMIT")
+
+
+def _steps(db: sqlite3.Connection, path: Path) -> tuple[Callable[[Query], None], ...]:
+    return missing_steps(str(path), _version(db), SCHEMA_VERSION)
+
+
+def _version(db: sqlite3.Connection) -> int:
+    return int(db.execute("PRAGMA user_version").fetchone()[0])
+
+
+def _keep_earlier(db: sqlite3.Connection, path: Path) -> None:
+    """Copy a store of an earlier schema, so that its release can be used again. Raises StorageError."""
+    kept = path.with_name(f"{path.name}.schema-{_version(db)}")
+    kept.unlink(missing_ok=True)
+    kept.touch(0o600)
+    with storage_errors(path):
+        db.execute("VACUUM INTO ?", (str(kept),))
+    _log.warning("store %s: brought forward to schema %d; the file before is %s", path, SCHEMA_VERSION, kept)
+
+
+def content_of(db: sqlite3.Connection, path: Path) -> tuple[str, int]:
+    """Return the id of the content and the number of its commits. Raises StorageError."""
+    properties = dict(db.execute("SELECT name, value FROM properties"))
+    count = properties.get("commits", "0")
+    if not properties.get("incarnation_id") or not count.isdecimal():
+        raise StorageError(f"store {path}: expected its properties, got damaged ones; {RESTORE_ADVICE}")
+    return properties["incarnation_id"], int(count)
+
+
+def require_all_rows(db: sqlite3.Connection, path: Path) -> None:
+    """Raise StorageError unless the rows of updates are those of the last commit, by the sum of their numbers."""
+    query = f"SELECT value FROM properties WHERE name = 'row_sum' AND value != CAST({_ROW_SUM} AS TEXT)"  # noqa: S608
+    if db.execute(query).fetchone():
+        raise StorageError(f"store {path}: expected all rows of its last commit, got others; {RESTORE_ADVICE}")
+
+
+def require_newest(db: sqlite3.Connection, path: Path, head: tuple[str, int] | None) -> None:
+    """Raise StorageError if the store lacks commits of its head, which was read first."""
+    name, commits = content_of(db, path)
+    if head is not None and (head[0] != name or head[1] > commits):
+        raise StorageError(
+            f"store {path}: expected commit {head[1]} of content {head[0]:.8}, got commit {commits} of {name:.8}: its "
+            f"log {path.name}-wal is missing or damaged, or another file is in its place; {RESTORE_ADVICE}"
+        )
 
 
 def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
@@ -92,15 +152,30 @@ def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
         _create_tables(db)
         return db
     opened.enter_context(locked(path))
-    if not path.exists():
-        _create(path)
-    db = opened.enter_context(contextlib.closing(open_existing(path)))
+    is_new = not path.exists()
+    if is_new:
+        if Path(f"{path.resolve()}-wal").exists():
+            raise StorageError(
+                f"store {path}: expected the file of its log {path.name}-wal, got none; {RESTORE_ADVICE}"
+            )
+        create(path)
+    db = opened.enter_context(contextlib.closing(open_existing(path, may_be_earlier=True)))
     with storage_errors(path):
+        if _version(db) != SCHEMA_VERSION:
+            _keep_earlier(db, path)
+            bring_forward(db, path)
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
         # freed pages are overwritten only where that costs no additional write
         db.execute("PRAGMA secure_delete = FAST")
         db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
+        # of a store that an earlier release made
+        db.execute(f"INSERT OR IGNORE INTO properties VALUES ('row_sum', {_ROW_SUM})")  # noqa: S608
+        head = content_of(db, path) if is_new else CommitHead(path).read()
+        require_newest(db, path, head)
+        if head is None and content_of(db, path)[1]:
+            renew_incarnation(db)
+            _log.warning("store %s: its file %s-head is missing or damaged; agents compare all data", path, path.name)
     return db
 
 
@@ -110,20 +185,22 @@ def _create_tables(db: sqlite3.Connection) -> None:
     renew_incarnation(db)
 
 
-def _create(path: Path) -> None:
+def create(path: Path) -> None:
     """Create an empty store, at once: a server that is killed meanwhile leaves no file under this name."""
     # the file behind a symbolic link, which may not exist yet
     path = path.resolve()
     new = path.with_name(path.name + "-new")
     new.unlink(missing_ok=True)
+    new.touch(0o600)
     with contextlib.closing(connect(new)) as db, storage_errors(path):
         _create_tables(db)
     new.replace(path)
 
 
 def renew_incarnation(db: sqlite3.Connection) -> None:
-    """Give the content a new id, so that the agents compare digests."""
-    db.execute("INSERT OR REPLACE INTO properties VALUES ('incarnation_id', ?)", (secrets.token_hex(16),))
+    """Give the content a new id, so that the agents compare digests; its commits are counted from here."""
+    values = f"('incarnation_id', ?), ('commits', '1'), ('row_sum', {_ROW_SUM})"
+    db.execute(f"INSERT OR REPLACE INTO properties VALUES {values}", (secrets.token_hex(16),))  # noqa: S608
 
 
 def connect(path: Path) -> sqlite3.Connection:
@@ -145,8 +222,10 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 def _explain(error: sqlite3.Error) -> str:
     text = str(error)
-    if "not a database" in text or "malformed" in text:
+    if "not a database" in text:
         return f"expected an undamaged GaussLite store ({text}); restore a backup"
+    if "malformed" in text:
+        return f"expected an undamaged GaussLite store ({text}); {RESTORE_ADVICE}"
     if "locked" in text:
         return "in use by another program; try again when it has ended"
     if "full" in text:
@@ -155,6 +234,7 @@ def _explain(error: sqlite3.Error) -> str:
 
 
 _DELETE = "DELETE FROM voxel_updates WHERE number = ?"
+_ADD_TO_SUM = "UPDATE properties SET value = value + ? WHERE name = 'row_sum'"
 _INSERT = "INSERT INTO voxel_updates VALUES (?, ?, ?, ?)"
 SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
 """UpdateRows."""
@@ -184,7 +264,9 @@ class SqliteStore(FusionStore):
             if max_bytes is not None:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
-            self.incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
+            self._head = opened.enter_context(contextlib.closing(CommitHead(None if path == IN_MEMORY else path)))
+            self.incarnation_id, self._commits = content_of(self._writer, path)
+            self._head.write(self.incarnation_id, self._commits)
             self._opened = opened.pop_all()
         self._is_closed, self._has_commits = Event(), False
         self._checkpoints = Thread(target=self._copy_log, name="checkpoints", daemon=True)
@@ -223,8 +305,12 @@ class SqliteStore(FusionStore):
             check = self._reader.execute("PRAGMA quick_check(1)").fetchone()[0]
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
+            self._log.epochs.load(self.records(EPOCH))
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
             self._log.load(self._require_intact(rows))
+            require_all_rows(self._reader, self._path)
+        for (name,) in self._read("SELECT DISTINCT name FROM records"):
+            self.records(name)
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = self._read(_SELECT_ROWS, (json.dumps(numbers),))
@@ -237,10 +323,13 @@ class SqliteStore(FusionStore):
         self._delete_rows(execute, change.deleted)
         for row in change.rows:
             execute(_INSERT, row)
+        execute(_ADD_TO_SUM, (sum(row[0] for row in change.rows),))
 
     def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
+        numbers = list(numbers)
         for number in numbers:
             execute(_DELETE, (number,))
+        execute(_ADD_TO_SUM, (-sum(numbers),))
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._read_lock, storage_errors(self._path):
@@ -251,9 +340,12 @@ class SqliteStore(FusionStore):
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 work(self._writer.execute)
+                self._writer.execute(COUNT_COMMIT)
                 self._writer.execute("COMMIT")
             except BaseException:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
+            self._commits += 1
+            self._head.write(self.incarnation_id, self._commits)
             self._has_commits = True

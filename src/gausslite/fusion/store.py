@@ -26,8 +26,11 @@ from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import GaussLiteError, SessionUnknownError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
+from gausslite.fusion.epochs import RECORD as EPOCH
+from gausslite.fusion.epochs import agent_of
 from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.score_index import AgentTotals, Scores, VoxelScoreTable
+from gausslite.fusion.tile_tables import keys_of
 from gausslite.fusion.update_log import (
     LogChange,
     PutOutcome,
@@ -55,6 +58,8 @@ CREATE TABLE properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """Those that SQLite and PostgreSQL have in common; SQLite takes any name of a type."""
 _PART_BYTES = 1 << 19
 _READ_ATTEMPTS = 20
+SLICE_VOXELS = 1024
+"""Of a map that leaves: its transaction and its vote delay a message by a few milliseconds."""
 # nothing, if a connection was lost after the commit and the work is done again
 _INSERT_PART = "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
 _DELETE_KEYFRAME = "DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?"
@@ -75,6 +80,7 @@ _SAVE_RECORD = """
 INSERT INTO records VALUES (?, ?, ?, ?)
 ON CONFLICT (name, agent_id) DO UPDATE SET checksum = excluded.checksum, data = excluded.data
 """
+_DELETE_RECORD = "DELETE FROM records WHERE name = ? AND agent_id = ?"
 _SELECT_RECORDS = "SELECT agent_id, data, checksum FROM records WHERE name = ?"
 # no agent can have an empty id
 _MISSION_CONFIG, _SESSION = ("", "mission-config"), "session"
@@ -117,18 +123,62 @@ class FusionStore(ABC):
                     self._log.apply(change)
         return change.outcomes
 
-    def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
+    def begin_map(self, agent_id: str, moved: Sequence[str] = (), dropped: Sequence[str] = ()) -> str:
+        """Begin another map of an agent, in constant time; returns the name that its present one has from then on.
 
-        def delete(execute: Execute) -> None:
-            self._delete_rows(execute, self._log.rows_of(agent_id))
-            for table in ("keyframes", "records") if self._is_home(agent_id) else ():
-                execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - constant names
-
+        moved, dropped: names of the records that stay with the former map, if it has updates, and of those to delete.
+        At the agent's home this begins an epoch; another server of the store follows.
+        """
         with self._log_lock:
-            self._write(delete)
+            epochs, epoch = self._log.epochs, int(self.find_record(agent_id, EPOCH) or 0)
+            former = epochs.former_name(agent_id)
+            if self._is_home(agent_id):
+                epoch += 1
+                kept = moved if agent_id in self.agents() else ()
+                rows = [_record(former, name, self.find_record(agent_id, name)) for name in kept]
+
+                def begin(execute: Execute) -> None:
+                    for row in (_record(agent_id, EPOCH, str(epoch).encode()), *(row for row in rows if row[-1])):
+                        execute(_SAVE_RECORD, row)
+                    for name in (*moved, *dropped):
+                        execute(_DELETE_RECORD, (name, agent_id))
+
+                self._write(begin)
             with self._index_lock:
-                return self._log.remove_agent(agent_id)
+                epochs.set(agent_id, epoch)
+                self._log.index.rename(agent_id, former)
+            return former
+
+    def remove_slice(self, name: str) -> Int64[ndarray, " v"]:
+        """Delete some tiles of a map, about SLICE_VOXELS; returns the keys of their voxels, ascending."""
+        with self._log_lock:
+            tiles, numbers = self._log.removable(name, SLICE_VOXELS)
+            if tiles:
+                self._write(lambda execute: self._delete_rows(execute, numbers))
+            with self._index_lock:
+                return self._log.remove(name, tiles)
+
+    def remove_agent(self, name: str) -> Int64[ndarray, " v"]:
+        """Delete a map's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
+        removed = [self.remove_slice(name)]
+        while len(removed[-1]):
+            removed.append(self.remove_slice(name))
+        if self._is_home(name):
+            label = self._log.epochs.label_of(name)
+
+            def delete(execute: Execute) -> None:
+                execute("DELETE FROM keyframes WHERE agent_id = ?", (label,))
+                execute("DELETE FROM records WHERE agent_id = ? AND name != ?", (name, EPOCH))
+
+            self._write(delete)
+        return np.sort(np.concatenate(removed))
+
+    def end_epochs(self, agent_id: str) -> None:
+        """Count the epochs of an agent without any data from the beginning, unless other servers may have some."""
+        if not self.is_shared:
+            with self._log_lock:
+                self.remove_record(agent_id, EPOCH)
+                self._log.epochs.set(agent_id, 0)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
@@ -139,6 +189,12 @@ class FusionStore(ABC):
         with self._index_lock:
             return self._log.index.totals(agent_id)
 
+    def memory_bytes(self, agent_id: str, added: Int64[ndarray, " k"]) -> int:
+        """Return the memory that all maps of an agent take, with updates of these voxels, at most."""
+        with self._index_lock:
+            own = [name for name in self._log.index.agents if agent_of(name) == agent_id]
+            return self._log.index.memory_bytes(own, agent_id, added)
+
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
         with self._index_lock:
@@ -147,7 +203,8 @@ class FusionStore(ABC):
     def keys(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Return the keys of an agent's updates (with tombstones), ascending."""
         with self._index_lock:
-            return np.ascontiguousarray(self._log.index.sorted_scores(agent_id)["keys"])
+            tables = {tile: own.table for tile, own in self._log.index.tiles(agent_id).items()}
+        return np.sort(keys_of(list(tables), list(tables.values())))
 
     def scores_of(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""
@@ -220,7 +277,7 @@ class FusionStore(ABC):
         deleted. Raises SessionUnknownError, StorageError.
         """
         parts = [data[start : start + _PART_BYTES] for start in range(0, max(len(data), 1), _PART_BYTES)]
-        key = agent_id, index
+        key = self._log.epochs.label_of(agent_id), index
         before = self._read("SELECT version, part FROM keyframes WHERE agent_id = ? AND frame_index = ?", key)
         version = 1 + max((own for own, _ in before), default=0)
 
@@ -257,18 +314,19 @@ class FusionStore(ABC):
 
     def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
         """Delete these keyframes of an agent, if they exist."""
+        label = self._log.epochs.label_of(agent_id)
 
         def delete(execute: Execute) -> None:
             for index in indices:
-                execute(_DELETE_KEYFRAME, (agent_id, index))
+                execute(_DELETE_KEYFRAME, (label, index))
 
         self._write(delete)
 
     def keyframe_sizes(self) -> dict[str, dict[int, int]]:
         """Return the number of bytes of each agent's keyframes by frame index."""
         sizes: dict[str, dict[int, int]] = {}
-        for agent_id, index, size in self._read(_SELECT_SIZES):
-            sizes.setdefault(agent_id, {})[index] = int(size)
+        for label, index, size in self._read(_SELECT_SIZES):
+            sizes.setdefault(self._log.epochs.name_of(label), {})[index] = int(size)
         return sizes
 
     def remove_unfinished_keyframes(self) -> None:
@@ -282,19 +340,18 @@ class FusionStore(ABC):
     def keyframe(self, agent_id: str, index: int) -> bytes:
         """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
         query = f"{SELECT_PARTS} AND agent_id = ? AND frame_index = ? ORDER BY part"
-        data = join_parts(self._read(query, (agent_id, index)))
+        data = join_parts(self._read(query, (self._log.epochs.label_of(agent_id), index)))
         if data is None:
             raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
         return data
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
-        row = name, agent_id, data_checksum(agent_id, name, data), data
-        self._write(lambda execute: execute(_SAVE_RECORD, row))
+        self._write(lambda execute: execute(_SAVE_RECORD, _record(agent_id, name, data)))
 
     def remove_record(self, agent_id: str, name: str) -> None:
         """Delete a named record of an agent, if it exists."""
-        self._write(lambda execute: execute("DELETE FROM records WHERE name = ? AND agent_id = ?", (name, agent_id)))
+        self._write(lambda execute: execute(_DELETE_RECORD, (name, agent_id)))
 
     def records(self, name: str) -> dict[str, bytes]:
         """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
@@ -352,6 +409,10 @@ class FusionStore(ABC):
     @abstractmethod
     def _damaged(self, what: str) -> StorageError:
         """Return the error of damaged content."""
+
+
+def _record(agent_id: str, name: str, data: bytes) -> tuple[str, str, int, bytes]:
+    return name, agent_id, data_checksum(agent_id, name, data), data
 
 
 def join_parts(rows: Sequence[PartRow]) -> bytes | None:

@@ -10,23 +10,23 @@ highest (update_seq, row) is a voxel's latest.
 from __future__ import annotations
 
 import itertools
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import google_crc32c
 import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
-from numpy.typing import NDArray
 
 from gausslite.codec.encoded_voxels import VOXELS, EncodedSubset, EncodedVoxels, join_elements
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
-from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of, tiles_of
-from gausslite.fusion.score_index import SCORES, ScoreIndex, Scores, newer_voxels
+from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of
+from gausslite.fusion.epochs import Epochs
+from gausslite.fusion.score_index import SCORES, VOXEL_UNITS, MapTile, ScoreIndex, Scores, newer_voxels
 
 UpdateRow = tuple[int, str, int, bytes]
-"""number, agent_id, checksum, voxels."""
+"""number, label of the map (see Epochs), checksum, voxels."""
 ReadRows = Callable[[Sequence[int]], Mapping[int, bytes]]
 """Returns the voxels of those of these rows that exist. Raises StorageError."""
 Places = tuple[Int64[ndarray, " _"], Int64[ndarray, " _"]]
@@ -37,8 +37,10 @@ SlotsOf = Callable[[Int64[ndarray, " n"]], Int64[ndarray, " n"]]
 """Returns the slot of each voxel; those of a tile have the same."""
 _SPARE_UNITS = 1 << 8
 """About 5 kB of Gaussians, which may be outdated in each tile."""
-_VOXEL_UNITS = 2
-"""The size of a voxel beside its Gaussians, in Gaussians."""
+_LEAST_SIZE = 16
+"""What a tile that is deleted costs at least, in voxels."""
+_LOADED_VOXELS = 1 << 16
+"""Those of the rows that are read at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,20 +51,8 @@ class PutOutcome:
     stale: Int64[ndarray, " s"]
 
 
-@dataclass(slots=True)
-class _Tile:
-    """An agent's rows in a tile, and the size of its voxels in use; sizes in units of one Gaussian."""
-
-    sizes: dict[int, int] = field(default_factory=dict)
-    used: int = 0
-
-    @property
-    def is_outdated(self) -> bool:
-        return sum(self.sizes.values()) - self.used > max(self.used, _SPARE_UNITS)
-
-
 _TileName = tuple[str, int]
-"""An agent and a tile."""
+"""A map and a tile."""
 
 
 @dataclass(slots=True)
@@ -81,29 +71,39 @@ class UpdateLog:
     """Owns the index of the rows. Not thread-safe: one thread plans and applies, readers of the index hold its lock."""
 
     def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
-        self.index = ScoreIndex()
+        self.index, self.epochs = ScoreIndex(), Epochs()
         self._slots_of = slots_of
-        self._tiles: dict[_TileName, _Tile] = {}
         # deleted by the next transaction
         self._outdated: list[int] = []
         # the highest number of a row, without its slot
         self._last = 0
 
     def load(self, rows: Iterable[UpdateRow]) -> None:
-        """Read all rows of a store; they are intact."""
-        tables: dict[str, list[tuple[int, NDArray[Any]]]] = {}
-        for number, agent_id, _, data in rows:
-            voxels = EncodedVoxels.from_row(data)
-            self._add_row((agent_id, tile_of(int(voxels.keys[0]))), number, _size(voxels))
+        """Read all rows of a store, which ascend in each slot; they are intact."""
+        parts: list[tuple[str, int, EncodedVoxels]] = []
+        size = 0
+        for number, label, _, data in rows:
+            # the index keeps no part of a row
+            parts.append((self.epochs.name_of(label), number, EncodedVoxels.from_row(data)))
             self._last = max(self._last, number & ((1 << SLOT_BITS) - 1))
-            tables.setdefault(agent_id, []).append((number, voxels.voxels.copy()))
-        for agent_id, parts in tables.items():
-            table = np.concatenate([own for _, own in parts])
-            numbers = np.repeat(np.array([number for number, _ in parts], np.int64), [len(own) for _, own in parts])
-            order = np.lexsort((numbers, table["update_seqs"], table["keys"]))
-            keys = table["keys"][order]
-            latest = order[np.append(keys[1:] != keys[:-1], True)[: len(keys)]]
-            self._put(agent_id, _scores(table[latest], numbers[latest]))
+            size += len(parts[-1][2])
+            if size >= _LOADED_VOXELS:
+                self._load(parts)
+                parts, size = [], 0
+        self._load(parts)
+
+    def _load(self, parts: Sequence[tuple[str, int, EncodedVoxels]]) -> None:
+        for name in {name for name, _, _ in parts}:
+            own = [(number, voxels) for owner, number, voxels in parts if owner == name]
+            for number, voxels in own:
+                self._add_row((name, tile_of(int(voxels.keys[0]))), number, _size(voxels))
+            scores = _scores_of(own)
+            order = np.lexsort((scores["rows"], scores["update_seqs"], scores["keys"]))
+            keys = scores["keys"][order]
+            latest = scores.take(order[np.append(keys[1:] != keys[:-1], True)[: len(keys)]])
+            # a row is newer than those that were read before
+            stored = self.index.scores_of(name, latest["keys"])["update_seqs"]
+            self.index.put(name, latest[latest["update_seqs"] >= stored])
 
     def plan(self, updates: Sequence[EncodedSubset], read: ReadRows) -> LogChange:
         """Return how to store messages of different agents, each completely. Raises StorageError."""
@@ -116,34 +116,42 @@ class UpdateLog:
             parts = accepted.by_tile()
             written = [row for part in parts for row in self._add(change, update.agent_id, part, read)]
             if written:
-                table = join_elements([voxels.voxels for _, voxels in written])
-                numbers = np.array([number for number, _ in written], np.int64)
-                rows = np.repeat(numbers, [len(voxels) for _, voxels in written])
-                change.puts.append((update.agent_id, _scores(table, rows)))
+                change.puts.append((update.agent_id, _scores_of(written)))
         return change
 
     def apply(self, change: LogChange) -> None:
         """Record a change whose transaction is committed."""
         self._outdated = []
         for name, numbers in change.emptied:
-            for number in numbers:
-                del self._tiles[name].sizes[number]
+            tile = self.index.tile(*name)
+            tile.rows, tile.written = array("q"), 0
             self._outdated += numbers
         for name, number, size in change.added:
             self._add_row(name, number, size)
-        for agent_id, scores in change.puts:
-            self._put(agent_id, scores)
+        for map_name, scores in change.puts:
+            self.index.put(map_name, scores)
 
-    def rows_of(self, agent_id: str) -> list[int]:
-        """Return the numbers of all rows of an agent, and of those that the next transaction deletes."""
-        own = (tile.sizes for (name, _), tile in self._tiles.items() if name == agent_id)
-        return [*itertools.chain.from_iterable(own), *self._outdated]
+    def removable(self, name: str, at_most: int) -> tuple[list[int], list[int]]:
+        """Return tiles of a map with about so many voxels, and what to delete with them: their rows, and outdated ones.
 
-    def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Record that `rows_of` an agent are deleted; returns the keys of its voxels, ascending."""
-        self._outdated = []
-        self._tiles = {name: tile for name, tile in self._tiles.items() if name[0] != agent_id}
-        return self.index.remove_agent(agent_id)
+        Nothing of an unknown map.
+        """
+        tiles: list[int] = []
+        numbers: list[int] = []
+        size = 0
+        for number, tile in self.index.tiles(name).items():
+            if size >= at_most:
+                break
+            tiles.append(number)
+            numbers += tile.rows
+            size += max(len(tile.table), len(tile.rows), _LEAST_SIZE)
+        return tiles, [*numbers, *self._outdated] if tiles else []
+
+    def remove(self, name: str, tiles: Sequence[int]) -> Int64[ndarray, " v"]:
+        """Record that what is `removable` is deleted; returns the keys of the voxels, ascending."""
+        if tiles:
+            self._outdated = []
+        return self.index.remove_tiles(name, tiles)
 
     def places(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> Places:
         """Return where the agent's updates of these voxels, or all, are."""
@@ -159,36 +167,34 @@ class UpdateLog:
     ) -> Iterator[tuple[int, EncodedVoxels]]:
         """Add a row with these voxels of a tile, and all others of the agent's tile if that is outdated; yields it."""
         name = agent_id, tile_of(int(part.keys[0]))
-        own = self._tiles.get(name)
+        own = self.index.tiles(agent_id).get(name[1])
         parts = {part.size_m: [part]}
-        if own is not None and own.is_outdated:
-            for number, data in read(sorted(own.sizes)).items():
+        if own is not None and _is_outdated(own):
+            for number, data in read(sorted(own.rows)).items():
                 voxels = EncodedVoxels.from_row(data)
                 is_used = self.index.scores_of(agent_id, voxels.keys)["rows"] == number
                 is_used &= ~np.isin(voxels.keys, part.keys)
                 if is_used.any():
                     parts.setdefault(voxels.size_m, []).append(voxels.take(np.flatnonzero(is_used)))
-            change.emptied.append((name, sorted(own.sizes)))
+            change.emptied.append((name, sorted(own.rows)))
         slot = int(self._slots_of(part.keys[:1])[0]) << SLOT_BITS
+        label = self.epochs.label_of(agent_id)
         for same_size in parts.values():
             self._last += 1
             number, voxels = slot + self._last, _in_order(EncodedVoxels.concatenate(same_size))
             data = voxels.to_row()
-            change.rows.append((number, agent_id, data_checksum(agent_id, number, data), data))
+            change.rows.append((number, label, data_checksum(label, number, data), data))
             change.added.append((name, number, _size(voxels)))
             yield number, voxels
 
     def _add_row(self, name: _TileName, number: int, size: int) -> None:
-        self._tiles.setdefault(name, _Tile()).sizes[number] = size
+        tile = self.index.tile(*name)
+        tile.rows.append(number)
+        tile.written += size
 
-    def _put(self, agent_id: str, scores: Scores) -> None:
-        """Replace the totals of these voxels in the index, and the sizes in use in their tiles."""
-        before = self.index.put(agent_id, scores)
-        was_used = np.where(before["rows"] >= 0, before["counts"] + _VOXEL_UNITS, 0)
-        sizes = (scores["counts"] + float(_VOXEL_UNITS)) - was_used
-        tiles, places = np.unique(tiles_of(scores["keys"]), return_inverse=True)
-        for tile, size in zip(tiles.tolist(), np.bincount(places, sizes, len(tiles)).tolist(), strict=True):
-            self._tiles[agent_id, tile].used += int(size)
+
+def _is_outdated(tile: MapTile) -> bool:
+    return tile.written - tile.used > max(tile.used, _SPARE_UNITS)
 
 
 def require_storable(update: EncodedSubset) -> None:
@@ -241,13 +247,15 @@ def _in_order(voxels: EncodedVoxels) -> EncodedVoxels:
 
 
 def _size(voxels: EncodedVoxels) -> int:
-    return len(voxels.gaussians) + _VOXEL_UNITS * len(voxels)
+    return len(voxels.gaussians) + VOXEL_UNITS * len(voxels)
 
 
-def _scores(table: NDArray[Any], rows: Int64[ndarray, " k"]) -> Scores:
-    """Return the totals of the voxels of elements of VOXELS, which are in these rows."""
+def _scores_of(rows: Sequence[tuple[int, EncodedVoxels]]) -> Scores:
+    """Return the totals of the voxels of these numbered rows, in order."""
+    table = join_elements([voxels.voxels for _, voxels in rows])
     scores = np.empty(len(table), SCORES)
     for name in VOXELS.names or ():
         scores[name] = table[name]
-    scores["rows"] = rows
+    numbers = np.array([number for number, _ in rows], np.int64)
+    scores["rows"] = np.repeat(numbers, [len(voxels) for _, voxels in rows])
     return scores

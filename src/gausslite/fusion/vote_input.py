@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -153,6 +153,17 @@ class VoteInput:
         """Use nothing of these voxels until they are moved; returns the fused voxels that may change."""
         moved = self._moved.setdefault(agent_id, _MovedVoxels())
         return _array(set().union(*(moved.replace(source, {}) for source in sources.tolist())))
+
+    def begin_map(self, agent_id: str, moved: Sequence[str], dropped: Sequence[str]) -> str:
+        """Begin another map of an agent; as FusionStore.begin_map. Raises StorageError."""
+        former = self._store.begin_map(agent_id, moved, dropped)
+        if agent_id in self._frames:
+            self._frames[former] = self._frames.pop(agent_id)
+        if agent_id in self._moved:
+            self._moved[former] = self._moved.pop(agent_id)
+        if former not in self.agents():
+            self.remove_agent(former)
+        return former
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " k"]:
         """Delete the agent's frame and its moved voxels; returns these."""

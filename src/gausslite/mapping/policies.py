@@ -90,7 +90,7 @@ _PARTS: dict[str, tuple[str, float | bool]] = {
     "depth-fill": ("seeding.fill_depth", False),
     "background-reserve": ("seeding.background_share", 0.0),
     "ema": ("optimization.ema_updates", 0.0),
-    "lr-decay": ("optimization.decay_after_updates", math.inf),
+    "lr-decay": ("optimization.adam.decay_after_updates", math.inf),
     "saturation": ("saturation.max_released", 0.0),
     "motion-mask": ("leaves_out_moving", False),
     "view-rotation": ("keyframes.rotates", False),
@@ -115,9 +115,7 @@ def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
     return settings
 
 
-def _with_field(settings: MapperSettings, path: str, value: Any) -> MapperSettings:
-    """Return the settings with another value of "field" or of "section.field"."""
-    section, _, name = path.rpartition(".")
-    if section:
-        name, value = section, replace(getattr(settings, section), **{name: value})
-    return replace(settings, **{name: value})
+def _with_field(settings: Any, path: str, value: Any) -> Any:
+    """Return the settings with another value of "field", or of "section.field" and so on."""
+    name, _, rest = path.partition(".")
+    return replace(settings, **{name: _with_field(getattr(settings, name), rest, value) if rest else value})

@@ -229,8 +229,8 @@ class Trainer:
         self, settings: MapperSettings, table: SplatTable, rasterizer: Rasterizer, rng: np.random.Generator
     ) -> None:
         self._settings = settings
-        self._adam, self._loss = settings.adam, settings.optimization.loss
-        self._half_size_adam = _with_half_rates(settings.adam)
+        self._adam, self._loss = settings.optimization.adam, settings.optimization.loss
+        self._half_size_adam = _with_half_rates(self._adam)
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng

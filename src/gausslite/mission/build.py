@@ -18,7 +18,7 @@ from gausslite.mapping.tracking import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import LoopMode, MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.detector import Detector, RegionDetector, TiledDetector, Tiling
+from gausslite.perception.detector import Detector, RegionDetector
 from gausslite.perception.detector_file import DetectorOptions, detector_advice, open_detector
 from gausslite.perception.relevance import (
     AsyncRelevanceEstimator,
@@ -72,12 +72,15 @@ def chosen_detector(perception: PerceptionSettings) -> Detector | None:
     """Open the user's detector file; None without one. Raises ModelFileError, InvalidInputError, MissingPluginError."""
     if perception.model is None:
         return None
-    tiling = Tiling(perception.tiles, perception.detection_time_s)
     options = DetectorOptions(
-        perception.segmenter, perception.vocabulary, perception.threads, perception.accept_similar
+        perception.segmenter,
+        perception.vocabulary,
+        perception.threads,
+        perception.accept_similar,
+        perception.tiles,
+        perception.detection_time_s,
     )
-    detector = open_detector(perception.model, options)
-    return detector if tiling.per_side == 1 else TiledDetector(detector, tiling)
+    return open_detector(perception.model, options)
 
 
 def region_estimator(regions: Sequence[Region]) -> RelevanceEstimator:

@@ -169,13 +169,15 @@ def selected_regions(
 
 
 def _target_region(point: TargetPoint, source: Source) -> Region:
-    """Return the ball of a point with a radius, else the object there. Raises InvalidInputError."""
+    """Return the ball of a point with a radius, else the object there. Raises InvalidInputError, MissingPluginError."""
     if point.radius_m is not None:
         return point.ball()
-    from gausslite.perception.pointing import region_at
+    from gausslite.perception.pointing import pointing
 
     step = max(1, len(source) // _SEARCHED_FRAMES)
-    return region_at(point.point_m, (frame for _, frame in usable_frames(source, range(0, len(source), step))))
+    return pointing().region_at(
+        point.point_m, (frame for _, frame in usable_frames(source, range(0, len(source), step)))
+    )
 
 
 def report_region_file(spec: str, source: Source) -> None:

@@ -32,7 +32,7 @@ from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM,
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.nouns import meant_by
-from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
+from gausslite.perception.detector_file import MAX_TILES_PER_SIDE
 from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.choose import backends
 from gausslite.render.cpu import MAX_THREADS, choose_threads
@@ -224,7 +224,7 @@ class PerceptionSettings:
     )
     accept_similar: bool = option(False, "also map objects of a class that is only similar to the task's noun")
     tiles: int = option(
-        DEFAULT_TILES_PER_SIDE,
+        2,
         "also detect in NxN enlarged parts of each keyframe, as time allows, to find small, distant objects; 1: off",
         low=1,
         high=MAX_TILES_PER_SIDE,

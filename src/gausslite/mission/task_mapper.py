@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -29,7 +29,7 @@ from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
-from gausslite.perception.pointing import pointed_masks
+from gausslite.perception.pointing import PointedMask, pointed_masks
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 from gausslite.render.rasterizer import Rendering
 
@@ -40,6 +40,8 @@ _LEAST_MOTION_M, _LEAST_MOTION_DEG = 0.02, 1.0
 """An image that is repeated at a pose within these is of a robot at rest."""
 _NS_PER_S = 1e9
 _MAX_SHOWN = 16
+_MAX_REEVALUATED = 3
+"""Earlier keyframes that are evaluated again with each frame, after a task change and when an object becomes known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,8 +213,8 @@ class TaskMapper:
         """Return the keyframes kept from the whole mission, oldest first."""
         return self._mapper.keyframes()
 
-    def pointed_masks(self, pointed: Iterable[PointedObject]) -> list[tuple[str, Bool[ndarray, "h w"], Frame]]:
-        """Return noun, mask and frame of each object pointed at on a known keyframe. Raises InvalidInputError."""
+    def pointed_masks(self, pointed: Sequence[PointedObject]) -> list[PointedMask]:
+        """Return the mask of each object pointed at on a known keyframe. Raises InvalidInputError."""
         frames = [*self._shown, *(keyframe.as_recorded for keyframe in self._mapper.keyframes())]
         return pointed_masks(pointed, sorted(frames, key=lambda frame: frame.capture_time_ns))
 
@@ -358,7 +360,7 @@ class TaskMapper:
 
     def _may_evaluate(self, keyframes: int) -> bool:
         """Return True if one more earlier keyframe may be evaluated with this frame."""
-        if keyframes == self._mapper.settings.task_change.keyframes_per_frame:
+        if keyframes == _MAX_REEVALUATED:
             return False
         return keyframes == 0 or self._scheduler.has_time_for(Stage.REEVALUATION)
 

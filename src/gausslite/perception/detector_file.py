@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from gausslite.domain.errors import ModelFileError
 from gausslite.perception.detector import Detector
 from gausslite.plugins import DEFAULT, Group, installed, load
+
+MAX_TILES_PER_SIDE: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +26,10 @@ class DetectorOptions:
     """None: as many as the runtime chooses."""
     accept_similar: bool = False
     """Also detect classes that are only similar to a noun."""
+    tiles_per_side: int = 1
+    """Also detect in this many times as many enlarged parts of the image; 1: in the whole image alone."""
+    time_limit_s: float | None = None
+    """No further part is started if it would end later than this after the detection began; None: all parts."""
 
 
 class DetectorReader(Protocol):

@@ -16,7 +16,7 @@ from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Detection
 from gausslite.nouns import is_convex
 from gausslite.perception.object_map import Observation
-from gausslite.perception.surface import mask_colours, mask_votes
+from gausslite.perception.surface import mask_votes
 
 _MIN_PIXELS = 8
 """Pixels with depth that an observation needs."""
@@ -121,7 +121,7 @@ def _lift(
 
     The paper lifts the pixel at the 2D centroid, which may lie outside the object; this lifts all pixels.
     siblings: pixels of the frame's detections of the same noun. own_pixels: the part of the mask that locates the
-    object. A weak detection has no votes and colours.
+    object. A weak detection has no votes.
     """
     rows, columns = np.nonzero(own_pixels & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
@@ -146,9 +146,7 @@ def _lift(
             return None
     if detection.is_weak:
         return replace(observation, rival=detection.rival, is_weak=True)
-    votes = mask_votes(detection.mask, frame, siblings)
-    colours = mask_colours(detection.mask, frame)
-    return replace(observation, rival=detection.rival, votes=votes, colours=colours)
+    return replace(observation, rival=detection.rival, votes=mask_votes(detection.mask, frame, siblings))
 
 
 def _own_pixels(detection: Detection, of_noun: Mapping[str, Bool[ndarray, "h w"]]) -> Bool[ndarray, "h w"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -11,8 +12,8 @@ from numpy import ndarray
 
 from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, ObjectRole
 from gausslite.domain.relevance import Rival
+from gausslite.domain.state import State
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.perception.colours import no_colours
 from gausslite.perception.surface import SurfaceVotes
 
 CELL_M = 0.05
@@ -32,8 +33,19 @@ _MIN_FOOTPRINT_SHARE = 0.25
 _MAX_CELLS = 4000
 MAX_OBJECTS = 500
 """Objects of a task; the least observed one is dropped first."""
-MAX_LEVELS = 50
-"""Levels of planes under an object, of which the median counts."""
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """What a plug-in has measured of an object's attributes, in one or several observations (`Selector.measured`)."""
+
+    def add(self, other: Self) -> Self:
+        """Return the attributes over the observations of both."""
+        ...
+
+    def state(self) -> State:
+        """Return the attributes as named arrays."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +55,7 @@ class Observation:
     The radius is twice the median distance of the points to the centroid: masks of chairs include background, which
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
     capture time. rival: a different thing detected in the same place. votes: which voxels the mask
-    shows inside and outside the object. colours: `colour_counts` of the mask's pixels.
-    levels_m: of planes seen under it, along up in the world. is_weak: of a weak detection.
+    shows inside and outside the object. is_weak: of a weak detection. measured: attributes that the mask shows.
     """
 
     phrase: str
@@ -56,9 +67,8 @@ class Observation:
     time_ns: int = 0
     rival: Rival | None = None
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
-    colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
-    levels_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     is_weak: bool = False
+    measured: Measured | None = None
 
     @classmethod
     def from_points(
@@ -105,8 +115,7 @@ class Landmark:
     score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
     weak_count: frames with a weak detection only, whose score is in score_sum.
-    colours: sums over its observations. levels_m: the latest levels of planes seen under it.
-    is_given: a person has pointed at it, so it exists whatever detections say.
+    is_given: a person has pointed at it, so it exists whatever detections say. measured: its attributes so far.
     """
 
     phrase: str
@@ -125,10 +134,9 @@ class Landmark:
     rival_scores: dict[str, float] = field(default_factory=dict)
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     missed_in_a_row: int = 0
-    colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
-    levels_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     weak_count: int = 0
     is_given: bool = False
+    measured: Measured | None = None
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -148,8 +156,7 @@ class Landmark:
             score_sum=observation.score,
             rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
             votes=observation.votes,
-            colours=observation.colours,
-            levels_m=observation.levels_m,
+            measured=observation.measured,
         )
 
     def is_colocated_with(self, other: Observation | Landmark) -> bool:
@@ -185,8 +192,7 @@ class Landmark:
             cells=self.cells,
             camera_m=camera_m,
             votes=self.votes,
-            colours=self.colours,
-            levels_m=self.levels_m,
+            measured=self.measured,
         )
 
     def add_weak(self, weak: Observation) -> None:
@@ -210,8 +216,8 @@ class Landmark:
         self.last_seen_ns = max(self.last_seen_ns, other.last_seen_ns)
         self.score_sum += other.score_sum
         self.votes = self.votes.add(other.votes)
-        self.colours = self.colours + other.colours
-        self.levels_m = np.concatenate([self.levels_m, other.levels_m])[-MAX_LEVELS:]
+        if self.measured is not None and other.measured is not None:
+            self.measured = self.measured.add(other.measured)
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         self._add_rivals(other.rival_scores)
         self._add_cells(other)

@@ -22,7 +22,6 @@ from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.relevance_tracker import RelevanceTracker
 from gausslite.perception.settings import RelevanceTrackerSettings
-from gausslite.perception.supporting_surface import nouns_known_by_height
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,8 +138,8 @@ class DetectingEstimator(RelevanceEstimator):
     def __init__(self, graph: TaskGraph, detector: Detector, settings: RelevanceTrackerSettings | None = None) -> None:
         self._graph = graph
         self._detector = detector
-        by_height = nouns_known_by_height(detector.matches(graph.queries))
-        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), by_height)
+        matches = detector.matches(graph.queries)
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), matches)
 
     @property
     def notes(self) -> tuple[str, ...]:

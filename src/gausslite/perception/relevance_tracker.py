@@ -29,14 +29,13 @@ from gausslite.domain.state import (
 )
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.nouns import is_generic
-from gausslite.perception.colours import ColourFilter, no_colours
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
-from gausslite.perception.object_map import MAX_LEVELS, MAX_OBJECTS, Landmark, ObjectMap, describe_landmarks
-from gausslite.perception.relations import NamedObjects, RelationFilter
+from gausslite.perception.object_map import MAX_OBJECTS, Landmark, Measured, ObjectMap, Observation, describe_landmarks
+from gausslite.perception.relations import NamedObjects
+from gausslite.perception.selector import open_selector
 from gausslite.perception.settings import RelevanceTrackerSettings
-from gausslite.perception.supporting_surface import FloorLevel, SupportingSurfaces
 from gausslite.perception.surface import VOXEL_SIZES_M, SurfaceVotes, refined_mask, surface_mask
 from gausslite.perception.targets import TargetSelector
 
@@ -53,19 +52,15 @@ class RelevanceTracker:
     frames follow from the measured surfaces of the objects.
     """
 
-    def __init__(
-        self, graph: TaskGraph, settings: RelevanceTrackerSettings, nouns_by_height: frozenset[str] = frozenset()
-    ) -> None:
-        """nouns_by_height: surfaces that the detector cannot find, whose height above the floor is known."""
+    def __init__(self, graph: TaskGraph, settings: RelevanceTrackerSettings, matches: Sequence[NounMatch] = ()) -> None:
+        """matches: what the detector searches for the graph's nouns. Raises MissingPluginError."""
         self._graph = graph
         self._settings = settings
         self._evidence = Evidence(settings.evidence)
         self._object_map = ObjectMap()
         up = self._up = np.array(unit_up_axis(settings.up_axis))
-        self._surfaces = SupportingSurfaces(graph, nouns_by_height, up)
-        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph))
-        relations = RelationFilter(graph, up, objects, self._surfaces)
-        self._targets = TargetSelector(graph, objects, relations, self._surfaces)
+        self._selector = open_selector(graph, matches, up)
+        self._targets = TargetSelector(graph, NamedObjects(self._object_map, self._evidence, self._selector))
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
         self._needs_observation = False
@@ -78,7 +73,7 @@ class RelevanceTracker:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What colours and heights decided, different things, low scores, and anchors that no frame has shown yet."""
+        """What attributes decided, different things, low scores, and anchors that no frame has shown yet."""
         return self._targets.notes(self._T_world_keyframe)
 
     @property
@@ -113,9 +108,7 @@ class RelevanceTracker:
             "keyframe_age": int_array(self._frames_since, self._needs_observation),
             "known_targets": int_array(*self._known_targets),
         }
-        floor = self._surfaces.floor
-        levels = [] if floor.first_camera_m is None else [floor.first_camera_m]
-        state |= {"floor_counts": floor.counts, "first_camera_m": np.array(levels, np.float64)}
+        state |= self._selector.state()
         state["excluded_m"] = self._targets.excluded_m
         state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
@@ -132,8 +125,8 @@ class RelevanceTracker:
             require_rigid("state T_world_keyframe", pose)
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
         self._targets.excluded_m = get_array(state, "excluded_m", (None, 3), np.float64).copy()
-        self._surfaces.floor = decode_floor(state)
-        self._object_map.restore([decode_landmark(saved) for saved in saved_landmarks])
+        self._selector.restore(state)
+        self._object_map.restore([decode_landmark(saved, self._selector.decode(saved)) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
         self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
@@ -148,7 +141,7 @@ class RelevanceTracker:
         lifted = lift_detections([detection], frame.depth_m, frame, self._up)
         if not lifted:
             raise InvalidInputError(f"pointed object: expected a {noun!r} with depth on frame {frame.index}, got none")
-        ((_, observation),) = lifted
+        ((_, observation),) = self._measured(lifted, frame)
         self._object_map.observe([observation])
         landmark = self._object_map.match(observation)
         assert landmark is not None
@@ -237,11 +230,8 @@ class RelevanceTracker:
         excluded = self._excluded_pixels(detections, frame)
         kept = self._drop_excluded(self._drop_generic_anchors(detections), excluded)
         depth_m = np.where(excluded, np.float32(0.0), depth_m)
-        localised = [
-            (detection, self._surfaces.with_level(observation, detection.mask, frame))
-            for detection, observation in lift_detections(kept, depth_m, frame, self._up)
-        ]
-        self._surfaces.observe(frame)
+        localised = self._measured(lift_detections(kept, depth_m, frame, self._up), frame)
+        self._selector.observe(frame)
         visibility = VisibilityCheck(frame, frame.depth_m)
         self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
         shown = [
@@ -254,6 +244,15 @@ class RelevanceTracker:
             for landmark, _, observation in shown
         )
         return [(landmark, mask) for landmark, mask, _ in shown]
+
+    def _measured(
+        self, lifted: Sequence[tuple[Detection, Observation]], frame: Frame
+    ) -> list[tuple[Detection, Observation]]:
+        """Return the observations with the attributes that their masks show."""
+        return [
+            (detection, replace(found, measured=self._selector.measured(found, detection.mask, frame)))
+            for detection, found in lifted
+        ]
 
     def _drop_generic_anchors(self, detections: Sequence[Detection]) -> list[Detection]:
         """Drop detections of a generic noun that are an anchor: "the object on the desk" is not the desk."""
@@ -314,14 +313,13 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "vote_keys": landmark.votes.keys,
         "votes": np.stack([landmark.votes.inside, landmark.votes.outside]),
         "vote_voxel_m": np.array([landmark.votes.voxel_m]),
-        "colours": landmark.colours,
-        "supports_m": landmark.levels_m,
         "score_sums": np.array([landmark.score_sum, *landmark.rival_scores.values()]),
+        **({} if landmark.measured is None else landmark.measured.state()),
     }
 
 
-def decode_landmark(state: State) -> Landmark:
-    """Decode a landmark. Raises MapFileError, InvalidInputError."""
+def decode_landmark(state: State, measured: Measured | None) -> Landmark:
+    """Decode a landmark with its attributes. Raises MapFileError, InvalidInputError."""
     x_m, y_m, z_m, radius_m = get_floats(state, "centroid_radius_m", 4)
     cells = get_array(state, "cells", (None,), np.int64).copy()
     counts = get_array(state, "counts", cells.shape, np.int64).copy()
@@ -340,12 +338,6 @@ def decode_landmark(state: State) -> Landmark:
     (voxel_m,) = get_floats(state, "vote_voxel_m", 1)
     if voxel_m not in VOXEL_SIZES_M:
         raise MapFileError(f"state landmark: expected voxels of {', '.join(map(str, VOXEL_SIZES_M))} m, got {voxel_m}")
-    colours = get_array(state, "colours", no_colours().shape, np.float64).copy()
-    if not np.isfinite(colours).all() or (colours < 0).any():
-        raise MapFileError("state landmark: expected colours of zero or more, got others")
-    levels_m = get_array(state, "supports_m", (None,), np.float64).copy()
-    if len(levels_m) > MAX_LEVELS or not np.isfinite(levels_m).all():
-        raise MapFileError(f"state landmark: expected at most {MAX_LEVELS} finite levels, got {len(levels_m)}")
     names = get_text(state, "rival_names").splitlines()
     score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
     return Landmark(
@@ -365,18 +357,7 @@ def decode_landmark(state: State) -> Landmark:
         rival_scores=dict(zip(names, rival_sums, strict=True)),
         votes=SurfaceVotes(keys, inside, outside, voxel_m),
         missed_in_a_row=missed_in_a_row,
-        colours=colours,
-        levels_m=levels_m,
         weak_count=weak_count,
         is_given=is_given > 0,
+        measured=measured,
     )
-
-
-def decode_floor(state: State) -> FloorLevel:
-    """Decode the observed heights. Raises MapFileError."""
-    empty = FloorLevel.before_frames()
-    counts = get_array(state, "floor_counts", empty.counts.shape, np.int64).copy()
-    levels_m = get_array(state, "first_camera_m", (None,), np.float64)
-    if (counts < 0).any() or len(levels_m) > 1 or not np.isfinite(levels_m).all():
-        raise MapFileError("state floor: expected counts of zero or more and at most one finite level, got others")
-    return FloorLevel(float(levels_m[0]) if len(levels_m) else None, counts)

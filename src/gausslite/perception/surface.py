@@ -16,7 +16,6 @@ from gausslite.domain.camera import back_project, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.perception.colours import colour_counts
 from gausslite.perception.detector import bounding_box
 
 VOXEL_SIZES_M: tuple[float, ...] = (0.00625, 0.0125, 0.025)
@@ -43,9 +42,6 @@ _EDGE_RADIUS_PX = 2
 """Pixels by which an outline moves to a colour edge: bottles' precision 0.75 to 0.77, a mug's 0.84 to 0.88."""
 _EDGE_EPSILON = 1e-4
 """Variance of colour, in squared shares of the Lab range, below which an edge is noise."""
-_MIN_INNER_PIXELS = 20
-"""Pixels inside the outline from which they alone give an object's colours."""
-_MAX_COLOUR_PIXELS = 500
 
 
 def is_in_large_part(points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, " n"]) -> Bool[ndarray, " n"]:
@@ -324,13 +320,6 @@ def mask_votes(
         has_vote = is_inside | ~siblings[window][is_known]
         points_m, is_inside = points_m[has_vote], is_inside[has_vote]
     return SurfaceVotes.from_points(points_m, is_inside)
-
-
-def mask_colours(mask: Bool[ndarray, "h w"], frame: Frame) -> Float64[ndarray, "balances ranges"]:
-    """Return the `colour_counts` of a mask's pixels, without its outline, which mixes with what is behind."""
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    pixels = frame.rgb[inner if np.count_nonzero(inner) >= _MIN_INNER_PIXELS else mask]
-    return colour_counts(pixels[:: max(1, len(pixels) // _MAX_COLOUR_PIXELS)])
 
 
 def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:

@@ -1,4 +1,4 @@
-"""Select the landmarks that a task means: by noun, colour, relations, scores and superlatives."""
+"""Select the landmarks that a task means: by noun, relations, attributes and scores."""
 
 from __future__ import annotations
 
@@ -10,27 +10,22 @@ from numpy import ndarray
 
 from gausslite.domain.objects import ObjectRole
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.perception.colours import ColourMatch
 from gausslite.perception.object_map import Landmark, Observation
-from gausslite.perception.relations import NamedObjects, RelationFilter, select_extreme
-from gausslite.perception.supporting_surface import SupportingSurfaces
+from gausslite.perception.relations import NamedObjects, RelationFilter
+from gausslite.perception.selector import Fit
 
 
 class TargetSelector:
     """Which landmarks are the task's targets, of all objects seen so far, whether in view or not."""
 
-    def __init__(
-        self, graph: TaskGraph, objects: NamedObjects, relations: RelationFilter, surfaces: SupportingSurfaces
-    ) -> None:
-        """All but the graph are shared with their owner, which observes frames."""
+    def __init__(self, graph: TaskGraph, objects: NamedObjects) -> None:
+        """The objects are shared with their owner, which observes frames."""
         self._graph = graph
         nouns = dict.fromkeys(noun_of(target) for target in graph.targets)
         self._names = {noun: [target for target in graph.targets if noun_of(target) == noun] for noun in nouns}
-        superlatives = {attributes.name: attributes.superlative for attributes in graph.attributes}
-        self._superlatives = {target: superlatives.get(target) for target in graph.targets}
         self._objects = objects
-        self._relations = relations
-        self._surfaces = surfaces
+        self._selector = objects.selector
+        self._relations = RelationFilter(graph, objects, objects.selector)
         self.excluded_m: Float64[ndarray, "n 3"] = np.zeros((0, 3))
         """Points on objects that a person has excluded."""
 
@@ -42,27 +37,24 @@ class TargetSelector:
         """
         evidence, chosen = self._objects.evidence, []
         for target, candidates in self._candidates(T_world_camera).items():
-            selected, superlative = evidence.without_low_scores(candidates), self._superlatives[target]
-            if selected and superlative is not None:
-                selected = [select_extreme(selected, superlative, self._surfaces.up, T_world_camera)]
+            selected = self._selector.select(target, evidence.without_low_scores(candidates), T_world_camera)
             chosen += [(landmark, target) for landmark in selected if evidence.is_present(landmark)]
         return chosen
 
     def target_of(self, observation: Observation) -> str | None:
-        """Return the target that an observation shows: its noun, colour and relations fit; None if there is none.
+        """Return the target that an observation shows: its noun, attributes and relations fit; None if there is none.
 
-        The first target whose colour is sure counts, else the first.
+        The first target whose attributes are sure counts, else the first.
         """
-        colours = self._objects.colours
-        names = [
-            name
+        fits = {
+            name: fit
             for name in self._names.get(observation.phrase, ())
-            if colours.allows(name, observation.colours) and self._relations.satisfies(name, observation)
-        ]
-        if not names or colours.is_excluded(observation.phrase, observation.colours):
+            if (fit := self._selector.fit(name, observation.measured)) is not Fit.NO
+            and self._relations.satisfies(name, observation)
+        }
+        if not fits or self._selector.is_excluded(observation.phrase, observation.measured):
             return None
-        sure = (name for name in names if colours.match(name, observation.colours) is ColourMatch.YES)
-        return next(sure, names[0])
+        return next((name for name, fit in fits.items() if fit is Fit.YES), next(iter(fits)))
 
     def role(self, landmark: Landmark) -> ObjectRole:
         """Return what an object is to the task, by all that was seen so far.
@@ -77,15 +69,13 @@ class TargetSelector:
         return ObjectRole.ANCHOR if is_anchor else ObjectRole.OTHER
 
     def notes(self, T_world_camera: Float64[ndarray, "4 4"] | None) -> tuple[str, ...]:
-        """Return what colours, heights and scores decided, and unseen anchors; T_world_camera: the latest viewpoint."""
+        """Return what attributes and scores decided, and unseen anchors; T_world_camera: the latest viewpoint."""
         objects = self._objects.object_map.objects
-        confirmed = self._objects.evidence.confirmed(objects)
         rivals = ((landmark.phrase, self._objects.evidence.rival(landmark)) for landmark in objects)
         low_scores = {} if T_world_camera is None else self._low_score_counts(T_world_camera)
-        unseen = dict.fromkeys(map(self._objects.colours.label, self._relations.unseen_anchors))
+        unseen = dict.fromkeys(map(self._selector.label, self._relations.unseen_anchors))
         return (
-            *self._objects.colours.notes([(landmark.phrase, landmark.colours) for landmark in confirmed]),
-            *self._height_notes(confirmed),
+            *self._selector.notes(self._objects.evidence.confirmed(objects), self._objects),
             *dict.fromkeys(
                 f"what looks like {noun!r} is rather {rival!r}: not activated; --accept-similar accepts it"
                 for noun, rival in rivals
@@ -97,26 +87,6 @@ class TargetSelector:
             ),
             *(f"anchor {name!r} not seen yet: its targets are kept" for name in unseen),
         )
-
-    def _height_notes(self, confirmed: list[Landmark]) -> list[str]:
-        """Return which relations heights decide, for how many of the objects, and what happens to the others."""
-        relations = {
-            (relation.target, relation.anchor): relation
-            for relation in self._graph.relations
-            if self._surfaces.is_by_height(relation)
-        }
-        notes = []
-        for relation in relations.values():
-            noun, anchor = noun_of(relation.target), noun_of(relation.anchor)
-            seen = [landmark for landmark in confirmed if landmark.phrase == noun]
-            sure = sum(self._surfaces.stands_on(relation, landmark) is not None for landmark in seen)
-            others = "compared with the class detected instead" if self._objects.seen(relation.anchor) else "kept"
-            others = "left out" if others == "kept" and relation.negated else others
-            notes.append(
-                f"no class of the detector is a {anchor!r}: the height of what an object stands on decides, so far "
-                f"for {sure} of {len(seen)} {noun!r} objects; the others are {others}"
-            )
-        return notes
 
     def _low_score_counts(self, T_world_camera: Float64[ndarray, "4 4"]) -> dict[str, int]:
         """Return how many objects of each target `select` leaves out for their scores, without targets of none."""
@@ -134,7 +104,7 @@ class TargetSelector:
             for landmark in confirmed
             if not self.is_excluded(landmark)
         ]
-        return {target: [landmark for landmark, name in named if name == target] for target in self._superlatives}
+        return {target: [landmark for landmark, name in named if name == target] for target in self._graph.targets}
 
     def is_excluded(self, landmark: Landmark) -> bool:
         """Return True if a person has excluded this object."""

@@ -254,9 +254,9 @@ _DEADLINE_S = 3.0
 _SERVING = health_pb2.HealthCheckResponse.SERVING
 
 
-def require_serving(address: str, tls: Tls | None) -> None:
+def require_serving(address: str, tls: Tls | None, service: str = "") -> None:
     """Raise UnavailableError if the service at this address does not answer SERVING within seconds."""
-    if _status(address, "", tls) != _SERVING:
+    if _status(address, service, tls) != _SERVING:
         raise UnavailableError(f"{address}: not serving")
 
 

@@ -20,7 +20,7 @@ from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport, TeamObject
-from gausslite.domain.relevance import CameraView, PointedObject, PointM
+from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
@@ -34,7 +34,6 @@ from gausslite.wire.channel import DEADLINE_S, MAX_MESSAGE_BYTES, ServiceChannel
 from gausslite.wire.convert import decode_colour, decode_depth, digests_from_messages
 from gausslite.wire.convert_task import report_to_message, team_object_from_message
 from gausslite.wire.security import Tls
-from gausslite.wire.views import StoredKeyframe, camera_view_from_message, stored_keyframe_from_message
 
 MAX_END_S = 90_000.0
 """Longer than any agent takes to end a mission: its drain-timeout is at most a day."""
@@ -141,9 +140,9 @@ class AgentClient(ServiceChannel):
         )
         return _decode_view(self._call(self._stub.RenderView, request), camera)
 
-    def camera_view(self) -> CameraView | None:
-        """Return the newest keyframe with its region and the camera's path; None before the first keyframe."""
-        return camera_view_from_message(self._call(self._stub.GetCameraView, agent_pb.GetCameraViewRequest()))
+    def camera_view(self) -> agent_pb.GetCameraViewResponse:
+        """Return the newest keyframe with its region and the camera's path; empty before the first keyframe."""
+        return self._call(self._stub.GetCameraView, agent_pb.GetCameraViewRequest())
 
     def watch_map(
         self, since_revision: int = 0, region: AxisAlignedBox | None = None, roi_only: bool = False
@@ -365,10 +364,10 @@ class FusionClient(ServiceChannel):
         request = pb.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
         return tuple(map(team_object_from_message, self._call(self._stub.QueryObjects, request).objects))
 
-    def keyframe(self, agent_id: str, index: int | None = None) -> StoredKeyframe | None:
-        """Return the keyframe of this index, else the newest; None without any. Raises InvalidInputError."""
+    def keyframe(self, agent_id: str, index: int | None = None) -> pb.GetKeyframeResponse:
+        """Return the keyframe of this index, else the newest; empty without any. Raises InvalidInputError."""
         request = pb.GetKeyframeRequest(mission_id=self.mission_id, agent_id=agent_id, index=index)
-        return stored_keyframe_from_message(self._call(self._stub.GetKeyframe, request))
+        return self._call(self._stub.GetKeyframe, request)
 
     def status(self) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""

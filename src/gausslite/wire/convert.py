@@ -144,6 +144,11 @@ def decode_mask(data: bytes, width_px: int, height_px: int) -> Bool[ndarray, "h 
     return _decode("mask", data, shape, np.uint8, "a one-channel PNG of up to 8 bits") > 0
 
 
+def decode_region(data: bytes, camera: Camera) -> Bool[ndarray, "h w"] | None:
+    """Decode the region of a keyframe; None for empty bytes. Raises InvalidInputError."""
+    return decode_mask(data, camera.width_px, camera.height_px) if data else None
+
+
 def decode_colour(data: bytes, width_px: int, height_px: int) -> UInt8[ndarray, "h w 3"]:
     """Decode colour of exactly this size. Raises InvalidInputError."""
     import cv2

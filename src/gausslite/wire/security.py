@@ -8,7 +8,7 @@ import logging
 import os
 import ssl
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -291,6 +291,12 @@ def _require_authorities(path: Path) -> None:
         raise InvalidInputError(f"--tls-ca {path}: expected certificates, got {error.reason or 'no PEM'}") from None
 
 
+def caller_or_connection(context: Any) -> str:
+    """Return who shares with others by turns: the caller, or a connection of this machine without a certificate."""
+    caller = Caller.of(context)
+    return str(context.peer()) if caller.names is None and caller.is_local else caller.key
+
+
 _BURST_S = 1.0
 
 
@@ -329,6 +335,8 @@ class TokenBucket:
 MESSAGE_BYTES = 4096
 """The cost of a message beside its own bytes; it limits the rate of small messages."""
 _RETRY_AFTER_S = 5.0
+_LARGE_BYTES, _UNREAD_BYTES, _UNREAD_OF_ONE = 1 << 16, 128 << 20, 32 << 20
+_READ_DEADLINE_S = 60.0
 _HANDSHAKE_S = 10.0
 
 
@@ -375,6 +383,7 @@ class CallUsage:
 
     limits: CallLimits
     _usages: dict[str, _Usage] = field(default_factory=dict)
+    _unread_bytes: Counter[str] = field(default_factory=Counter)
 
     @contextmanager
     def open_call(self, caller: Caller) -> Iterator[TokenBucket | None]:
@@ -394,6 +403,32 @@ class CallUsage:
             yield usage.bandwidth
         finally:
             usage.open_calls -= 1
+
+    def require_read(self, context: Any) -> None:
+        """Raise RateLimitError if the caller, or all together, have too much that they have not read."""
+        caller = caller_or_connection(context)
+        if self._unread_bytes[caller] > _UNREAD_OF_ONE or self._unread_bytes.total() > _UNREAD_BYTES:
+            raise RateLimitError(
+                f"answers: expected at most {_UNREAD_OF_ONE >> 20} MiB that are not read of a caller and "
+                f"{_UNREAD_BYTES >> 20} of all, got {self._unread_bytes[caller] >> 20} of {caller[:200]} and "
+                f"{self._unread_bytes.total() >> 20}; read them first",
+                retry_after_s=_RETRY_AFTER_S,
+            )
+
+    def hold_answer(self, context: Any, answer_bytes: int) -> None:
+        """Count a large answer until the caller has read it. The task that calls this ends if that is late."""
+        task = asyncio.current_task()
+        if answer_bytes < _LARGE_BYTES or task is None:
+            return
+        caller = caller_or_connection(context)
+        self._unread_bytes[caller] += answer_bytes
+        timer = asyncio.get_running_loop().call_later(_READ_DEADLINE_S, task.cancel)
+
+        def release(_: Any) -> None:
+            timer.cancel()
+            self._unread_bytes -= Counter({caller: answer_bytes})
+
+        context.add_done_callback(release)
 
     def _forget_idle_callers(self) -> None:
         """Delete what is known of callers that use nothing, so that many addresses do not fill the memory."""

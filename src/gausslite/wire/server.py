@@ -271,7 +271,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
         async def answer(request: Any, context: Any) -> Any:
             async with self._admit(call, request, context) as decoded:
-                return await inner(decoded, context)
+                response = await inner(decoded, context)
+                self._usage.hold_answer(context, response.ByteSize())
+                return response
 
         async def answer_stream(request: Any, context: Any) -> AsyncIterator[Any]:
             async with self._admit(call, request, context) as decoded:
@@ -289,6 +291,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         try:
             caller = security.Caller.of(context)
             security.require_role(call.name, caller)
+            self._usage.require_read(context)
             with self._usage.open_call(caller) as bandwidth:
                 if call.handler.request_streaming:
                     yield call.read_stream(context, bandwidth)

@@ -16,11 +16,13 @@ from __future__ import annotations
 
 import heapq
 import json
+import logging
 import math
 import os
 import secrets
 import sqlite3
 import threading
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,10 +35,13 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
+from gausslite.codec.commit_head import COUNT_COMMIT, CommitHead
 from gausslite.codec.encoded_voxels import from_records, to_records
 from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,17 +67,19 @@ _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
     key INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
     count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL,
-    sends INTEGER NOT NULL DEFAULT 0, acknowledged_seq INTEGER);
+    sends INTEGER NOT NULL DEFAULT 0, acknowledged_seq INTEGER, checksum INTEGER);
 CREATE TABLE IF NOT EXISTS keyframes (
     frame_index INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, value REAL NOT NULL, coverage BLOB NOT NULL,
-    data BLOB NOT NULL, pending INTEGER NOT NULL);
+    data BLOB NOT NULL, pending INTEGER NOT NULL, checksum INTEGER);
 CREATE TABLE IF NOT EXISTS properties (name TEXT PRIMARY KEY, value) WITHOUT ROWID;
 """
 _ENQUEUE = """
-INSERT INTO voxel_updates (key, enqueue_count, purpose, kappa_sum, count, gaussians, pending, sent_kappa, sends)
-VALUES (?, 1, ?, ?, ?, ?, 1, -1, 0)
+INSERT INTO voxel_updates
+    (key, enqueue_count, purpose, kappa_sum, count, gaussians, pending, sent_kappa, sends, checksum)
+VALUES (?, 1, ?, ?, ?, ?, 1, -1, 0, ?)
 ON CONFLICT (key) DO UPDATE SET enqueue_count = enqueue_count + 1, purpose = excluded.purpose,
-    kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1
+    kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1,
+    checksum = excluded.checksum
 WHERE kappa_sum != excluded.kappa_sum OR gaussians != excluded.gaussians
 """
 # a byte's value with the opposite sign, so that value and key ascend together
@@ -82,6 +89,12 @@ ALTER TABLE voxel_updates ADD COLUMN place REAL AS
 CREATE INDEX voxel_updates_by_value ON voxel_updates (purpose, place, key) WHERE pending = 1;
 DROP INDEX IF EXISTS voxel_updates_pending;
 """
+# of what is sent; the other columns say when it is sent
+_CHECKSUMS = {"voxel_updates": "crc(key, kappa_sum, count, gaussians)", "keyframes": "crc(frame_index, coverage, data)"}
+_DAMAGED = (
+    "is damaged ({}); move it and its log away to begin with an empty one: an agent with --state sends its saved map "
+    "again, other updates and keyframes that the server has not acknowledged are lost"
+)
 _SELECT_SLICE = f"""
 SELECT place, key, {_WIRE_BYTES_PER_VOXEL} + {_WIRE_BYTES_PER_GAUSSIAN} * count,
     sent_kappa < 0 OR count = 0 OR kappa_sum <= 0.75 * sent_kappa
@@ -94,9 +107,9 @@ _SELECT_PENDING = """
 SELECT key, enqueue_count, kappa_sum, count, gaussians FROM voxel_updates WHERE key = ? AND pending = 1
 """
 _ENQUEUE_KEYFRAME = """
-INSERT INTO keyframes VALUES (?, 1, ?, ?, ?, 1)
+INSERT INTO keyframes VALUES (?, 1, ?, ?, ?, 1, ?)
 ON CONFLICT (frame_index) DO UPDATE SET enqueue_count = enqueue_count + 1, value = excluded.value,
-    coverage = excluded.coverage, data = excluded.data, pending = 1
+    coverage = excluded.coverage, data = excluded.data, pending = 1, checksum = excluded.checksum
 """
 _SELECT_KEYFRAMES = "SELECT frame_index, value, coverage, data, enqueue_count FROM keyframes"
 _DUE_KEYFRAMES = """
@@ -149,16 +162,22 @@ class Spool:
         self._path, self.agent_id = path, agent_id
         self._error_prefix = "spool" if path is None else f"spool {path}"
         self._lock = threading.RLock()
+        self._head, self._commits, self.token = CommitHead(path), 0, ""
         with self._storage_errors():
+            if path is not None:
+                path.touch(0o600)
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
+            self._database.create_function("crc", -1, _crc, deterministic=True)
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
+            self._check_pages()
             self._database.executescript(_SCHEMA)
             self._add_new_columns()
+            self._check_rows()
             self.is_new = self._property("agent_id") is None
             if self.is_new:
                 properties = [("agent_id", agent_id), ("voxel_size_m", grid.size_m), ("update_seq", 0)]
-                properties.append(("token", secrets.token_hex(16)))
+                properties += [("token", secrets.token_hex(16)), ("commits", 1)]
                 self._database.executemany("INSERT INTO properties VALUES (?, ?)", properties)
                 self._database.commit()
             stored = self._property("agent_id"), self._property("voxel_size_m")
@@ -170,31 +189,54 @@ class Spool:
                 f"{self._error_prefix}: expected agent {agent_id!r} and voxels of {grid.size_m} m, "
                 f"got {stored[0]!r} and {stored[1]} m; choose another file"
             )
+        self._begin_head()
+
+    def _begin_head(self) -> None:
+        """Compare the commits with those of the head; it goes on from here."""
+        last, self._commits = self._head.read(), int(self._property("commits") or 0)
+        is_lost = last is None and self._commits > 0 and not self.is_new
+        if is_lost or (last is not None and (last[0] != self.token or last[1] > self._commits)):
+            _log.warning(
+                "%s: may lack its last updates (its log or its head is missing or damaged, or another file is in its "
+                "place); they are sent when their voxels change again",
+                self._error_prefix,
+            )
+        self._head.write(self.token, self._commits)
+
+    def _check_pages(self) -> None:
+        found = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
+        if found != "ok":
+            raise StorageError(f"{self._error_prefix}: {_DAMAGED.format(' '.join(found.split()))}")
+
+    def _check_rows(self) -> None:
+        for table, checksum in _CHECKSUMS.items():
+            query = f"SELECT count(*) FROM {table} WHERE checksum IS NOT {checksum}"  # noqa: S608
+            [[damaged]] = self._database.execute(query)
+            if damaged:
+                raise StorageError(f"{self._error_prefix}: {_DAMAGED.format(f'{damaged} rows of {table}')}")
 
     def _add_new_columns(self) -> None:
-        """Bring the tables of an earlier version up to date."""
+        """Bring the tables of the two versions before up to date, and order them."""
         columns = [row[1] for row in self._database.execute("PRAGMA table_xinfo (voxel_updates)")]
-        if "sends" not in columns:
-            self._database.execute("ALTER TABLE voxel_updates ADD COLUMN sends INTEGER NOT NULL DEFAULT 0")
         if "acknowledged_seq" not in columns:
-            self._database.execute("ALTER TABLE voxel_updates ADD COLUMN acknowledged_seq INTEGER")
-            acknowledged = "SELECT update_seq FROM sent_updates WHERE sent_updates.key = voxel_updates.key"
-            self._database.execute(f"UPDATE voxel_updates SET acknowledged_seq = ({acknowledged})")  # noqa: S608
-            self._database.execute("DROP TABLE sent_updates")
-            self._database.commit()
+            raise StorageError(f"{self._error_prefix}: of another release; let that one send it, or move it away")
         if "place" not in columns:
             self._database.executescript(_SORTED)
+        for table, checksum in _CHECKSUMS.items() if "checksum" not in columns else ():
+            self._database.execute(f"ALTER TABLE {table} ADD COLUMN checksum INTEGER")
+            self._database.execute(f"UPDATE {table} SET checksum = {checksum}")  # noqa: S608
+            self._database.commit()
 
     def enqueue(self, batch: VoxelBatch, purpose: Purpose) -> None:
         """Replace the stored updates of these voxels; an update equal to the stored one changes nothing."""
         records = to_records(batch.gaussians)
         offsets = batch.offsets.tolist()
         sums = np.minimum(batch.kappa_sums, np.uint64(_MAX_INTEGER)).tolist()
-        rows = (
-            (key, int(purpose), kappa_sum, stop - start, records[start:stop].tobytes())
+        values = (
+            (key, kappa_sum, stop - start, records[start:stop].tobytes())
             for key, kappa_sum, (start, stop) in zip(batch.keys.tolist(), sums, pairwise(offsets), strict=True)
         )
-        self._update(_ENQUEUE, rows)
+        self._update(_ENQUEUE, ((own[0], int(purpose), *own[1:], _crc(*own)) for own in values))
 
     def voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
         """Return the keys of the voxels whose latest update has Gaussians, ascending; purpose: only updates for it."""
@@ -225,7 +267,8 @@ class Spool:
         """Store a selected keyframe as pending, and delete the one that it replaces in the selection."""
         with self._transaction():
             self._database.execute("DELETE FROM keyframes WHERE frame_index = ?", (replaced,))
-            row = keyframe.frame_index, keyframe.value, keyframe.coverage, keyframe.data
+            index, value, coverage, data = keyframe.frame_index, keyframe.value, keyframe.coverage, keyframe.data
+            row = index, value, coverage, data, _crc(index, coverage, data)
             self._database.execute(_ENQUEUE_KEYFRAME, row)
 
     def mark_keyframes_done(self, keyframes: Iterable[SpooledKeyframe]) -> None:
@@ -309,6 +352,7 @@ class Spool:
         """Close the database."""
         with self._lock:
             self._database.close()
+            self._head.close()
 
     def _due_voxels(self, purpose: Purpose, resend_threshold: float) -> Iterator[_Due]:
         """Yield the due voxels, those of the highest value first. Between two slices, others may use the spool."""
@@ -337,12 +381,19 @@ class Spool:
     def _transaction(self) -> Iterator[None]:
         with self._lock, self._storage_errors(), self._database:
             yield
+            if self._database.in_transaction:
+                self._database.execute(COUNT_COMMIT)
+                self._database.commit()
+                self._commits += 1
+                self._head.write(self.token, self._commits)
 
     @contextmanager
     def _storage_errors(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
+            if "malformed" in str(error) or "not a database" in str(error):
+                raise StorageError(f"{self._error_prefix}: {_DAMAGED.format(error)}") from error
             advice = "free some space or choose another file"
             if self._path is not None and not os.access(self._path.absolute().parent, os.W_OK):
                 advice = f"expected a file in a folder that user {os.geteuid()} can write"
@@ -351,6 +402,14 @@ class Spool:
     def _property(self, name: str) -> str | float | None:
         row = self._database.execute("SELECT value FROM properties WHERE name = ?", (name,)).fetchone()
         return None if row is None else row[0]
+
+
+def _crc(*values: int | bytes) -> int:
+    """Return the CRC-32 of numbers and data."""
+    crc = 0
+    for value in values:
+        crc = zlib.crc32(value if isinstance(value, bytes) else b"%d " % value, crc)
+    return crc
 
 
 def _take(due: Iterable[_Due], max_bytes: int) -> list[_Due]:

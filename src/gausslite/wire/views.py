@@ -1,26 +1,44 @@
-"""Views of a mission for a person, as messages: the newest keyframe with its region, and a stored one of an agent."""
+"""The view of an agent's camera as a message, and what wakes the watchers of a map."""
 
 from __future__ import annotations
 
 import asyncio
-import math
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.checks import require_name
-from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.relevance import CameraView, DetectedBox, DetectedImage
+from gausslite.domain.errors import QuotaError
+from gausslite.domain.relevance import CameraView, DetectedImage
+from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as agent_pb
-from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
 from gausslite.wire import convert
 
 MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
+_MAX_VIEW_PX = 1920 * 1080
+MAX_VIEWS_WAITING = 16
 _SIDES = ("left_px", "top_px", "right_px", "bottom_px")
+
+
+def view_camera_from_message(message: geometry_pb2.Camera) -> Camera:
+    """Decode the camera of a view to render. Raises QuotaError above two megapixels, InvalidInputError."""
+    camera = convert.camera_from_message(message)
+    pixels = camera.width_px * camera.height_px
+    if pixels > _MAX_VIEW_PX:
+        raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+    return camera
+
+
+def view_to_pngs(camera: Camera, rendering: Rendering | None) -> dict[str, bytes]:
+    """Encode a view as the fields of its message; None, of an empty map, is black without depth."""
+    size = camera.height_px, camera.width_px
+    rgb, depth_m = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
+    if rendering is not None:
+        rgb, depth_m = rendering.rgb, rendering.expected_depth_m()
+    rgb_8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8)
+    return {"colour_png": convert.encode_colour(rgb_8, lossless=True), "depth_png": convert.encode_depth(depth_m)}
 
 
 def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewResponse:
@@ -46,24 +64,6 @@ def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewRes
     )
 
 
-def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraView | None:
-    """Decode a view; None for an agent without keyframes. Raises InvalidInputError, PoseError."""
-    if not message.colour_jpeg:
-        return None
-    camera = convert.camera_from_message(message.camera)
-    return CameraView(
-        rgb=convert.decode_colour(message.colour_jpeg, camera.width_px, camera.height_px),
-        roi=convert.decode_mask(message.region_png, camera.width_px, camera.height_px),
-        camera=camera,
-        frame_index=message.frame_index,
-        T_world_camera=convert.transform_from_message("camera view t_world_camera", message.t_world_camera),
-        times_ns=np.array([view_pose.capture_time_ns for view_pose in message.path], np.int64),
-        path=_poses("path", [view_pose.t_world_camera for view_pose in message.path], MAX_POSES),
-        keyframes=_poses("keyframes", list(message.keyframes), MAX_KEYFRAMES),
-        detected=_detected_from_message(message.detected) if message.HasField("detected") else None,
-    )
-
-
 def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
     height_px, width_px = detected.rgb.shape[:2]
     boxes = sorted(detected.boxes, key=lambda box: -box.score)[:MAX_BOXES]
@@ -79,30 +79,6 @@ def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
             for box in boxes
         ],
     )
-
-
-def _detected_from_message(message: agent_pb.DetectedImage) -> DetectedImage:
-    if not 0 < message.width_px * message.height_px <= convert.MAX_IMAGE_PX:
-        size = f"{message.width_px}x{message.height_px}"
-        raise InvalidInputError(f"detected image: expected 1 to {convert.MAX_IMAGE_PX} pixels, got {size}")
-    if len(message.boxes) > MAX_BOXES:
-        raise InvalidInputError(f"detected boxes: expected at most {MAX_BOXES}, got {len(message.boxes)}")
-    boxes = []
-    for box in message.boxes:
-        require_name("detected phrase", box.phrase)
-        box_px = box.left_px, box.top_px, box.right_px, box.bottom_px
-        if not all(math.isfinite(value) for value in (*box_px, box.score)):
-            raise InvalidInputError("detected boxes: expected finite numbers, got others")
-        boxes.append(DetectedBox(box.phrase, box.score, box_px, is_weak=box.is_weak))
-    rgb = convert.decode_colour(message.colour_jpeg, message.width_px, message.height_px)
-    return DetectedImage(message.frame_index, rgb, tuple(boxes))
-
-
-def _poses(name: str, messages: list[geometry_pb2.RigidTransform], highest: int) -> Float64[ndarray, "n 4 4"]:
-    if len(messages) > highest:
-        raise InvalidInputError(f"camera view {name}: expected at most {highest} poses, got {len(messages)}")
-    poses = [convert.transform_from_message(f"camera view {name}", message) for message in messages]
-    return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 
 def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
@@ -148,43 +124,3 @@ class ChangeNotifier:
         self._subscriptions = 0
         self._next_change.set()
         self._next_change = asyncio.Event()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredKeyframe:
-    """A keyframe with its frame index. T_world_camera: in the fused map's frame, None if the agent's does not fit.
-
-    indices: of all keyframes that the server has of the agent, the newest last. roi: True in the task's region, None if
-    the agent did not send it.
-    """
-
-    index: int
-    capture_time_ns: int
-    rgb: UInt8[ndarray, "h w 3"]
-    camera: Camera
-    T_world_camera: Float64[ndarray, "4 4"] | None
-    indices: tuple[int, ...]
-    roi: Bool[ndarray, "h w"] | None = None
-
-
-def region_from_png(data: bytes, camera: Camera) -> Bool[ndarray, "h w"] | None:
-    """Decode the region of a keyframe; None for empty bytes. Raises InvalidInputError."""
-    return convert.decode_mask(data, camera.width_px, camera.height_px) if data else None
-
-
-def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyframe | None:
-    """Decode a keyframe; None if the server has none of the agent. Raises InvalidInputError, PoseError."""
-    if not message.colour:
-        return None
-    camera, pose = convert.camera_from_message(message.camera), None
-    if message.HasField("t_world_camera"):
-        pose = convert.transform_from_message("keyframe t_world_camera", message.t_world_camera)
-    return StoredKeyframe(
-        index=message.index,
-        capture_time_ns=message.capture_time_ns,
-        rgb=convert.decode_colour(message.colour, camera.width_px, camera.height_px),
-        camera=camera,
-        T_world_camera=pose,
-        indices=tuple(message.indices),
-        roi=region_from_png(message.region_png, camera),
-    )

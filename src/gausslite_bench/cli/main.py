@@ -14,7 +14,7 @@ from gausslite_bench.chaos.run import ChaosSettings, run_chaos
 from gausslite_bench.cli.loop import configure_loop
 from gausslite_bench.cli.parser import configure_parser
 from gausslite_bench.cli.perception import configure_perception
-from gausslite_bench.cli.quality import configure_ablation, configure_quality
+from gausslite_bench.cli.quality import configure_ablation, configure_compute, configure_quality
 from gausslite_bench.cli.team import configure_team
 from gausslite_bench.fuzz.run import FuzzSettings, run_fuzz
 from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, run_gpu, run_raster
@@ -44,6 +44,7 @@ class _Measurement:
 _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
     "quality": (configure_quality, "map quality of every policy on held-out views, at an equal budget"),
     "ablation": (configure_ablation, "map quality with the paper's components enabled one by one"),
+    "compute": (configure_compute, "map quality as one quantity grows: iterations, time, frames or Gaussians"),
     "team": (configure_team, "quality of the fused map of several agents, by strategy and policy"),
     "perception": (configure_perception, "accuracy of a detector's masks against ground truth, stage by stage"),
     "parser": (configure_parser, "accuracy and speed of a task parser on known sentences"),

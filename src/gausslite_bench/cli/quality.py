@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar, progress_bar
+from gausslite.codec.state_file import write_atomic
 from gausslite.config.option import build, option
 from gausslite.domain.errors import InvalidInputError
-from gausslite.mapping.policies import POLICIES
+from gausslite.mapping.policies import POLICIES, TASK, UNIFORM
 from gausslite.mission.settings import MAX_RATE_HZ, MIN_RATE_HZ
 from gausslite_bench.cli.study_options import (
     DEFAULT_HOME_FRAMES,
@@ -21,6 +22,7 @@ from gausslite_bench.cli.study_options import (
     write_results,
 )
 from gausslite_bench.quality.equal_time import RATE_FILE, with_measured_rate
+from gausslite_bench.quality.growth import curves, growth_plot, growth_table
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import choose_home_tasks
 from gausslite_bench.quality.scenes import UnseenRegionError
@@ -69,6 +71,25 @@ class _AblationOptions:
     equal: str = option(_BOTH, _EQUAL_HELP, choices=_EQUAL)
 
 
+_GROWTH_STEPS = {
+    "iterations": ("4", "8", "16", "32", "64", "128"),
+    "rate": ("8", "4", "2", "1"),
+    "frames": ("15", "30", "60", "120"),
+    "max-gaussians": ("10000", "30000", "100000", "300000"),
+}
+"""The quantities that may grow, and the default steps; a lower rate gives a frame more time."""
+
+
+@dataclass(frozen=True, slots=True)
+class _GrowthOptions:
+    quantity: str = option("iterations", "what grows; the other limits stay", choices=tuple(_GROWTH_STEPS))
+    steps: tuple[str, ...] = option((), "its values from the least to the most", metavar="N,...")
+    pairs: tuple[str, ...] = option((), f"{_PAIR_HELP} (default: {_ABLATION_TASK}, or none with --real)", metavar="A,B")
+    policies: tuple[str, ...] = option((TASK, UNIFORM), "policies", metavar="A,B")
+    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...")
+    views: int = option(24, "held-out views per home", low=2)
+
+
 def configure_quality(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench quality`."""
     add_study_options(parser, _QualityOptions, _BudgetOptions)
@@ -97,6 +118,43 @@ def run_ablation(options: argparse.Namespace) -> int:
     results = _run(options, study)
     _write(options.out, "ablation", ablation_table(results), results)
     return 0
+
+
+def configure_compute(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench compute`."""
+    add_study_options(parser, _GrowthOptions)
+    parser.set_defaults(run=run_compute, equal=str(BudgetMode.ITERATIONS), rate=None, lpips_weights=None)
+
+
+def run_compute(options: argparse.Namespace) -> int:
+    """Let one quantity grow, and write compute.md, compute.svg and compute.json; 1 if a curve falls."""
+    chosen = build(_GrowthOptions, options)
+    steps = chosen.steps or _GROWTH_STEPS[chosen.quantity]
+    variants = [Variant(name, name) for name in chosen.policies]
+    # wrong values fail here, before hours of work
+    studies = {
+        step: _study(_with_step(options, chosen.quantity, step), chosen.pairs, (_ABLATION_TASK,), variants)
+        for step in steps
+    }
+    results = {step: _run(options, study) for step, study in studies.items()}
+    found = curves(results)
+    table = growth_table(chosen.quantity, steps, found)
+    trials = [trial for step in results.values() for trial in step.trials_as_json()]
+    write_results(options.out, "compute", table, trials)
+    write_atomic(options.out / "compute.svg", growth_plot(steps, found).encode())
+    print(f"{table}→ {options.out / 'compute.md'}, compute.svg")
+    return int(any(curve.falls for curve in found))
+
+
+def _with_step(options: argparse.Namespace, quantity: str, step: str) -> argparse.Namespace:
+    """Return the options with another value of the quantity. Raises InvalidInputError."""
+    try:
+        value = float(step) if quantity == "rate" else int(step)
+    except ValueError:
+        raise InvalidInputError(f"steps: expected numbers such as {_GROWTH_STEPS[quantity][0]}, got {step!r}") from None
+    name = quantity.replace("-", "_")
+    equal = BudgetMode.TIME if quantity == "rate" else BudgetMode.ITERATIONS
+    return argparse.Namespace(**{**vars(options), name: value, "equal": str(equal)})
 
 
 def _study(

@@ -125,7 +125,7 @@ def ablation_table(results: StudyResults) -> str:
             [variant, *(_number(results.mean(scenes, variant, *column), column[0]) for column in columns)]
             for variant in results.variants
         ]
-        blocks += [f"## {name}{task}", _markdown(rows)]
+        blocks += [f"## {name}{task}", markdown(rows)]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -136,7 +136,7 @@ def _means(results: StudyResults, metrics: Sequence[Metric], budget: TrialBudget
         means = (results.mean(results.scenes, variant, metric, budget) for metric in metrics)
         cells = [_number(mean, metric) for mean, metric in zip(means, metrics, strict=True)]
         rows.append([variant, *cells, *results.costs(variant, budget)])
-    return _markdown(rows)
+    return markdown(rows)
 
 
 def _by_scene(results: StudyResults, roi: Metric, full: Metric, budget: TrialBudget) -> str:
@@ -148,9 +148,9 @@ def _by_scene(results: StudyResults, roi: Metric, full: Metric, budget: TrialBud
         rows.append([scene, results.tasks[scene], results.shown(scene), *cells, *signed])
     known = [margin for scene in results.scenes if (margin := results.margin(scene, roi, budget)) is not None]
     if not known:
-        return _markdown(rows)
+        return markdown(rows)
     ahead = f"{sum(margin > 0 for margin in known)} of {len(known)}, by {fmean(known):+.2f} dB in the mean"
-    return f"{_markdown(rows)}\n\n`{results.variants[0]}` exceeds the best other policy in {ahead}."
+    return f"{markdown(rows)}\n\n`{results.variants[0]}` exceeds the best other policy in {ahead}."
 
 
 def _with_spread(values: Sequence[float], metric: Metric) -> str:
@@ -161,7 +161,8 @@ def _number(value: float | None, metric: Metric) -> str:
     return "–" if value is None else f"{value:.{metric.digits}f}"
 
 
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table whose first row is the header."""
     lines = [f"| {' | '.join(row)} |" for row in rows]
     lines.insert(1, "|" + "---|" * len(rows[0]))
     return "\n".join(lines)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.wire.clients import FusionClient
+from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.convert import frame_to_message
 from gausslite_bench.async_calls import UpdateStream, UpdateStreams
 from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, keyframe, object_report
@@ -99,6 +99,29 @@ class AgentLoad:
                 task.cancel()
             await asyncio.gather(*tasks, *others, return_exceptions=True)
         return times_s, len(refused)
+
+
+def load_of_calls(call: Callable[[], object], seconds: float, rate_hz: float) -> LoadResult:
+    """Call at this rate from one caller; a time counts from when a call was due."""
+    begin_s, count, times_s = time.monotonic(), max(int(seconds * rate_hz), 1), []
+    for index in range(count):
+        due_s = begin_s + index / rate_hz
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        if time.monotonic() > begin_s + seconds + _SETTLE_S:
+            break
+        call()
+        times_s.append(time.monotonic() - due_s)
+    p50, p99 = np.percentile(times_s, [50, 99]) * 1000
+    return LoadResult(1, count, float(p50), float(p99), count - len(times_s), 0)
+
+
+def load_of_frames(agent: AgentClient, seconds: float) -> LoadResult:
+    """Count the frames that an agent maps of its source; their ages are those of the latest frames."""
+    begin, count = agent.status(), int(seconds * RATE_HZ)
+    time.sleep(seconds)
+    end = agent.status()
+    mapped = end.frames_mapped - begin.frames_mapped
+    return LoadResult(1, count, 1000 * end.age_p50_seconds, 1000 * end.age_p99_seconds, count - mapped, 0)
 
 
 async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: list[float]) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import shlex
+import socket
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,13 +19,17 @@ from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.wire.clients import FusionClient
 from gausslite_bench.report import Report
-from gausslite_bench.server.agent_load import AgentLoad, LoadResult
+from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult
 from gausslite_bench.server.hostile import ATTACKS, measure_attack
 from gausslite_bench.server.synthetic_updates import GAUSSIANS_PER_VOXEL
 from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
 _P99_LIMIT_MS = 100.0
 _STATUS_CALLS = 5
+_OTHERS = {
+    "ParserService": "gausslite_parser",
+    "AgentService": f"gausslite_agent --source sim:home --task 'Pick up the mug' --rate {RATE_HZ}",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +44,7 @@ class ServerBenchSettings:
     server: str = option(FUSION_SERVER, "starts the server (default: with its default options)", metavar="COMMAND")
     hostile: tuple[str, ...] = option(
         (),
-        f"only measure 4 agents under these attacks, each on a new server: all, or some of {', '.join(ATTACKS)}",
+        f"only measure good callers under these attacks, each on a new server: all, or some of {', '.join(ATTACKS)}",
         metavar="A,B",
     )
 
@@ -57,7 +64,7 @@ def run_server(settings: ServerBenchSettings) -> Report:
         attacks = []
         with progress_bar(len(names), "attacks", "attack") as progress:
             for name in names:
-                with _new_server(settings) as server:
+                with _new_server(settings, ATTACKS[name].service) as server:
                     attacks.append(measure_attack(name, server, settings.held[0], settings.seconds))
                 progress.update()
         return Report({"server": settings.server, "held": settings.held[0], "attacks": attacks})
@@ -71,11 +78,18 @@ def run_server(settings: ServerBenchSettings) -> Report:
 
 
 @contextmanager
-def _new_server(settings: ServerBenchSettings) -> Iterator[ServiceProcess]:
+def _new_server(settings: ServerBenchSettings, service: str = "FusionService") -> Iterator[ServiceProcess]:
+    """Start the fusion server, or another service; the parser at a port, where it can tell its callers apart."""
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        command = f"{settings.server} --store {folder}/store.sqlite"
-        yield stack.enter_context(closing(ServiceProcess(command, Path(folder))))
+        command, address = f"{settings.server} --store {folder}/store.sqlite", ""
+        if service != "FusionService":
+            # an agent without a task's relevance needs no detector
+            command = f"{shlex.quote(sys.executable)} -m {_OTHERS[service]}"
+        if service == "ParserService":
+            with socket.create_server(("127.0.0.1", 0)) as free:
+                address = f"127.0.0.1:{free.getsockname()[1]}"
+        yield stack.enter_context(closing(ServiceProcess(command, Path(folder), address=address)))
 
 
 def _measure(

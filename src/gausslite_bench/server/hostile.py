@@ -1,4 +1,4 @@
-"""Attack a fusion server from a process of its own, while good agents send and their acknowledgements are timed.
+"""Attack a service from a process of its own, while others use it and the time of its answers to them is taken.
 
 `python -m gausslite_bench.server.hostile ATTACK ADDRESS` attacks until its standard input ends.
 """
@@ -14,20 +14,21 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.voxels import RoiSubset
-from gausslite.wire.channel import require_serving
-from gausslite.wire.clients import FusionClient
+from gausslite.wire.channel import ServiceChannel, require_serving
+from gausslite.wire.clients import AgentClient, FusionClient, ParserClient
 from gausslite.wire.convert import frame_to_message
 from gausslite_bench.async_calls import UpdateStreams
-from gausslite_bench.server.agent_load import AgentLoad
+from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult, load_of_calls, load_of_frames
 from gausslite_bench.server.synthetic_updates import (
     GAUSSIANS_PER_VOXEL,
     GRID,
@@ -43,17 +44,27 @@ GOOD_AGENTS = 4
 _SEQ = 1 << 20
 _SAMPLE_S = 0.2
 _STORM_THREADS = 8
+_HELD_VOXELS = 400_000
+_TOKEN = "bad"  # noqa: S105 - of the attackers
 _NOUN = "mug"
+_TASK = f"Pick up the {_NOUN} on the table"
+_LONG_TASK = ", then ".join([_TASK] * 27)
 
 
-def _note_begin() -> None:
+def _note_begin(nice: int = 10) -> None:
+    """Let the measurement begin; with a low priority, as if the attacker ran on another machine."""
+    os.nice(nice)
     sys.stdout.write("attacking\n")
     sys.stdout.flush()
 
 
+def _client(address: str, deadline_s: float) -> FusionClient:
+    return FusionClient(address, deadline_s, token=_TOKEN)
+
+
 def _join(address: str, count: int) -> list[tuple[str, str]]:
     """Return the names of these attackers and their sessions."""
-    with FusionClient(address, deadline_s=60.0) as client:
+    with _client(address, 60.0) as client:
         return [(name, client.join(name, GRID).session_id) for name in (f"bad-{number}" for number in range(count))]
 
 
@@ -79,17 +90,22 @@ def _resend(address: str, count: int, make: Callable[[str], bytes]) -> None:
     asyncio.run(run())
 
 
-def _storm(address: str, call: Callable[[FusionClient, int], object]) -> None:
+def _storm(
+    address: str,
+    call: Callable[[Any, int], object],
+    connect: Callable[[str, float], ServiceChannel] = FusionClient,
+    callers: int = _STORM_THREADS,
+) -> None:
     """Call from several threads, each again as soon as it is answered, whatever the answer."""
 
     def repeat(thread: int) -> None:
-        with FusionClient(address, deadline_s=60.0) as client:
-            for number in itertools.count(thread, _STORM_THREADS):
+        with connect(address, 60.0) as client:
+            for number in itertools.count(thread, callers):
                 with contextlib.suppress(GaussLiteError):
                     call(client, number)
 
     _note_begin()
-    threads = [threading.Thread(target=repeat, args=(thread,), daemon=True) for thread in range(_STORM_THREADS)]
+    threads = [threading.Thread(target=repeat, args=(thread,), daemon=True) for thread in range(callers)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -108,9 +124,53 @@ def _storm_of_queries(address: str) -> None:
     _storm(address, lambda client, _: client.query_objects(_NOUN))
 
 
-def _storm_of_views(address: str) -> None:
-    frame = keyframe(0, 320, 240)
-    _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera))
+def _storm_of_views(address: str, callers: int, connect: Callable[[str, float], ServiceChannel] = FusionClient) -> None:
+    frame = keyframe(0, 1920, 1080)
+    _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
+
+
+async def _send(address: str, session_id: str, messages: Iterable[bytes]) -> None:
+    async with UpdateStreams(address) as streams:
+        stream = streams.open(session_id)
+        for message in messages:
+            await stream.send(message)
+        await stream.close()
+
+
+def _hold_map(address: str) -> str:
+    """Join and store _HELD_VOXELS; returns the session."""
+    ((name, session_id),) = _join(address, 1)
+    parts = np.array_split(np.arange(1_000_000, 1_000_000 + _HELD_VOXELS), 100)
+    subsets = (RoiSubset(name, "", seq, seq, voxels_batch(part, seq, 1)) for seq, part in enumerate(parts, start=1))
+    asyncio.run(_send(address, session_id, (encode_subset(subset, GRID) for subset in subsets)))
+    return session_id
+
+
+def _new_maps(address: str) -> None:
+    _hold_map(address)
+
+    def begin(client: FusionClient, _: int) -> None:
+        session_id = client.join("bad-0", GRID, fresh_map=True).session_id
+        asyncio.run(_send(address, session_id, [_voxels("bad-0", 50)]))
+
+    _storm(address, begin, _client, callers=1)
+
+
+def _storm_of_digests(address: str) -> None:
+    session_id = _hold_map(address)
+    _storm(address, lambda client, _: client.stored_digests(session_id), callers=16)
+
+
+def _new_snapshot(client: FusionClient, number: int) -> None:
+    next(update for update in client.watch(exclude_agent=f"name-{number}") if update.last)
+
+
+def _compute(_address: str) -> None:
+    _note_begin(nice=0)
+    parent = os.getpid()
+    is_parent = os.fork() != 0
+    while is_parent or os.getppid() == parent:
+        pass
 
 
 def _large_keyframes(address: str) -> None:
@@ -157,39 +217,72 @@ def _half_open(address: str) -> None:
     asyncio.run(run())
 
 
-ATTACKS: Mapping[str, tuple[str, Callable[[str], None]]] = {
-    "large": ("48 streams of messages of 300 kB", lambda to: _resend(to, 48, lambda name: _voxels(name, 850))),
-    "tiny": ("16 streams of messages of one voxel", lambda to: _resend(to, 16, lambda name: _voxels(name, 1))),
-    "tombstones": (
+class Attack(NamedTuple):
+    """What an attack does, the function that does it without end, and the service whose other callers are measured."""
+
+    does: str
+    run: Callable[[str], None]
+    service: str = "FusionService"
+
+
+ATTACKS: Mapping[str, Attack] = {
+    "busy": Attack("the control: two processes that only compute", _compute),
+    "large": Attack("48 streams of messages of 300 kB", lambda to: _resend(to, 48, lambda name: _voxels(name, 850))),
+    "tiny": Attack("16 streams of messages of one voxel", lambda to: _resend(to, 16, lambda name: _voxels(name, 1))),
+    "tombstones": Attack(
         "a stream of messages of 200 000 tombstones",
         lambda to: _resend(to, 1, lambda name: tombstone_message(name, 200_000, _SEQ)),
     ),
-    "names": ("8 threads that join under new names", lambda to: _storm(to, lambda c, n: c.join(f"name-{n}", GRID))),
-    "queries": ("8 threads that query 48 x 200 objects", _storm_of_queries),
-    "views": ("8 threads that render 320 x 240", _storm_of_views),
-    "keyframes": ("8 threads of keyframes of 1920 x 1080, noise as PNG", _large_keyframes),
-    "slow-readers": ("64 watchers that read one block", _slow_readers),
-    "half-open": ("300 silent connections, 384 silent streams", _half_open),
+    "names": Attack("8 that join under new names", lambda to: _storm(to, lambda c, n: c.join(f"name-{n}", GRID))),
+    "queries": Attack("8 that query 48 x 200 objects", _storm_of_queries),
+    "render": Attack("60 that render 1920 x 1080", lambda to: _storm_of_views(to, 60)),
+    "watchers": Attack(
+        "50 that watch the map anew, each without another name", lambda to: _storm(to, _new_snapshot, callers=50)
+    ),
+    "fresh-map": Attack("one that holds 400 000 voxels and begins new maps of 50", _new_maps),
+    "digests": Attack("16 that ask for the digests of 400 000 voxels", _storm_of_digests),
+    "keyframes": Attack("8 that send keyframes of 1920 x 1080, noise as PNG", _large_keyframes),
+    "slow-readers": Attack("64 watchers that read one block", _slow_readers),
+    "half-open": Attack("300 silent connections, 384 silent streams", _half_open),
+    "parser": Attack(
+        "48 that parse 1000 characters",
+        lambda to: _storm(to, lambda client, _: client.parse(_LONG_TASK), ParserClient, 48),
+        "ParserService",
+    ),
+    "busy-parser": Attack("the control of parser", _compute, "ParserService"),
+    "agent-render": Attack("8 that render 1920 x 1080", lambda to: _storm_of_views(to, 8, AgentClient), "AgentService"),
+    "busy-agent": Attack("the control of agent-render", _compute, "AgentService"),
 }
-"""What each attack does, and the function that does it without end."""
+
+
+def _good_load(attack: str, address: str, held: int, seconds: float) -> Callable[[], LoadResult]:
+    """Prepare a new service; returns what measures those who use it well."""
+    service = ATTACKS[attack].service
+    if service == "FusionService":
+        agents = AgentLoad(address)
+        agents.fill(held, GAUSSIANS_PER_VOXEL)
+        return lambda: agents.run(GOOD_AGENTS, seconds)
+    if service == "ParserService":
+        parser = ParserClient(address, deadline_s=60.0)
+        return lambda: load_of_calls(lambda: parser.parse(_TASK), seconds, RATE_HZ)
+    return lambda: load_of_frames(AgentClient(address, deadline_s=60.0), seconds)
 
 
 def measure_attack(attack: str, server: ServiceProcess, held: int, seconds: float) -> dict[str, object]:
-    """Fill a new server, and measure good agents without and under an attack, and what the server says of itself.
+    """Measure who uses a new service well, without and under an attack, and what the service says of itself.
 
     rss_mib: memory before the attack, rss_growth_mib: its largest growth. unhealthy: share of the health checks that
     were not SERVING, slowest_health_ms: of their answers. log: lines that the server wrote.
     """
-    load = AgentLoad(server.address)
-    load.fill(held, GAUSSIANS_PER_VOXEL)
-    quiet = load.run(GOOD_AGENTS, seconds)
+    load = _good_load(attack, server.address, held, seconds)
+    quiet = load()
     rss_mib, logged = server.rss_mib(), len(server.log.read_bytes())
     with _watched(server) as samples, _attacking(attack, server.address):
-        attacked = load.run(GOOD_AGENTS, seconds)
+        attacked = load()
     memory_mib, are_healthy, answers_s = zip(*samples, strict=True)
     return {
         "attack": attack,
-        "does": ATTACKS[attack][0],
+        "does": ATTACKS[attack].does,
         "quiet": asdict(quiet),
         "attacked": asdict(attacked),
         "rss_mib": rss_mib,
@@ -202,7 +295,7 @@ def measure_attack(attack: str, server: ServiceProcess, held: int, seconds: floa
 
 @contextmanager
 def _attacking(attack: str, address: str) -> Iterator[None]:
-    """Attack from another process; it has a low priority, as if it ran on another machine."""
+    """Attack from another process."""
     command = [sys.executable, "-m", __name__, attack, address]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe) as process:  # noqa: S603 - this program
@@ -239,14 +332,13 @@ def _watched(server: ServiceProcess) -> Iterator[list[tuple[float, bool, float]]
 
 def _run(arguments: Sequence[str]) -> None:
     attack, address = arguments
-    os.nice(10)
 
     def exit_with_input() -> None:
         sys.stdin.read()
         os._exit(0)
 
     threading.Thread(target=exit_with_input, daemon=True).start()
-    ATTACKS[attack][1](address)
+    ATTACKS[attack].run(address)
 
 
 if __name__ == "__main__":

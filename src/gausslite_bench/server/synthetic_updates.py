@@ -25,10 +25,12 @@ _PATCHES = 8
 _NOISE_M, _COLOUR_NOISE = 0.001, 0.03
 
 
-def voxels_batch(voxels: Sequence[int] | NDArray[np.int64], seed: int) -> VoxelBatch:
-    """Return these voxels of the floor, by number, each with GAUSSIANS_PER_VOXEL Gaussians on its surface."""
+def voxels_batch(
+    voxels: Sequence[int] | NDArray[np.int64], seed: int, per_voxel: int = GAUSSIANS_PER_VOXEL
+) -> VoxelBatch:
+    """Return these voxels of the floor, by number, each with so many Gaussians on its surface."""
     rng = np.random.default_rng(seed)
-    patch, cell = np.divmod(np.repeat(np.asarray(voxels, np.int64), GAUSSIANS_PER_VOXEL), DELTA_VOXELS)
+    patch, cell = np.divmod(np.repeat(np.asarray(voxels, np.int64), per_voxel), DELTA_VOXELS)
     corners = np.stack([patch % _PATCHES_IN_ROW, patch // _PATCHES_IN_ROW], axis=1) * _PATCH_COLUMNS
     corners += np.stack([cell % _PATCH_COLUMNS[0], cell // _PATCH_COLUMNS[0]], axis=1)
     n = len(cell)

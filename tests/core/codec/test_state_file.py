@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import signal
 import struct
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gausslite.codec.state_file import FORMAT, read_state, write_state
+from gausslite.codec.state_file import FORMAT, read_state, write_atomic, write_state
 from gausslite.domain.errors import MapFileError, StorageError
 
 U8 = {"dtype": "U8", "shape": [1], "data_offsets": [0, 1]}
@@ -102,4 +106,37 @@ def test_a_state_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "run.state"
     write_state(path, {"a": np.zeros(3)})
     assert path.stat().st_mode & 0o777 == 0o644
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_next_write_replaces_what_a_killed_one_left(tmp_path: Path) -> None:
+    path = tmp_path / "run.state"
+    program = f"""
+import os, signal
+from pathlib import Path
+from gausslite.codec.state_file import write_atomic_with
+def write(temporary):
+    temporary.write_bytes(bytes(9999))
+    os.kill(os.getpid(), signal.SIGKILL)
+write_atomic_with(Path({str(path)!r}), write)
+"""
+    for _ in range(2):
+        assert subprocess.run([sys.executable, "-c", program], check=False).returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
+    write_state(path, {"a": np.zeros(3)}, 0o600)
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert read_state(path)["a"].tolist() == [0, 0, 0]
+
+
+def test_writers_of_one_name_take_turns(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+
+    def write_some(number: int) -> None:
+        for _ in range(30):
+            write_atomic(path, bytes([number]) * 100_000)
+            assert len(set(path.read_bytes())) == 1
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write_some, range(4)))
     assert list(tmp_path.iterdir()) == [path]

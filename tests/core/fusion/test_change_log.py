@@ -81,13 +81,13 @@ def record(change_log: ChangeLog, store: SqliteStore, subset: RoiSubset) -> list
 def test_only_a_change_of_the_fused_map_is_recorded() -> None:
     change_log, store = ChangeLog(first_revision=100), SqliteStore()
     assert record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3, 2: 1}))) == [1, 2]
-    assert change_log.voxels.revisions.revision == 101
+    assert change_log.voxels.revision == 101
     assert record(change_log, store, RoiSubset("bee", "", 1, 1, make_batch({1: 2}))) == []
-    assert change_log.voxels.revisions.revision == 101
+    assert change_log.voxels.revision == 101
     assert record(change_log, store, RoiSubset("bee", "", 2, 2, make_batch({1: 5, 2: 0, 3: 0}))) == [1]
-    assert change_log.voxels.revisions.changed_since(101).tolist() == [1]
-    assert change_log.voxels.revisions.changed_since(100).tolist() == [1, 2]
-    assert change_log.voxels.revisions.changed_since(102).tolist() == []
+    assert change_log.voxels.changed_since(101).tolist() == [1]
+    assert change_log.voxels.changed_since(100).tolist() == [1, 2]
+    assert change_log.voxels.changed_since(102).tolist() == []
 
 
 @pytest.mark.parametrize("revision", [0, 99, 103, 10**18])
@@ -95,7 +95,7 @@ def test_a_revision_from_before_a_restart_is_gone(revision: int) -> None:
     change_log, store = ChangeLog(first_revision=100), SqliteStore()
     record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3})))
     with pytest.raises(RevisionGoneError, match="expected 100 to 101"):
-        change_log.voxels.revisions.changed_since(revision)
+        change_log.voxels.changed_since(revision)
 
 
 def test_the_number_of_recorded_removals_is_limited() -> None:
@@ -103,9 +103,9 @@ def test_the_number_of_recorded_removals_is_limited() -> None:
     record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 1, 2: 1, 3: 1})))
     for revision, key in enumerate((1, 2, 3), start=2):
         record(change_log, store, RoiSubset("ant", "", revision, revision, make_batch({key: 0})))
-    assert change_log.voxels.revisions.revision == 5
+    assert change_log.voxels.revision == 5
     with pytest.raises(RevisionGoneError):
-        change_log.voxels.revisions.changed_since(2)
-    assert change_log.voxels.revisions.changed_since(3).tolist() == [2, 3]
+        change_log.voxels.changed_since(2)
+    assert change_log.voxels.changed_since(3).tolist() == [2, 3]
     record(change_log, store, RoiSubset("ant", "", 9, 9, make_batch({3: 1})))
-    assert change_log.voxels.revisions.changed_since(3).tolist() == [2, 3]
+    assert change_log.voxels.changed_since(3).tolist() == [2, 3]

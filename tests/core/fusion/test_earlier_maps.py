@@ -1,4 +1,4 @@
-"""A robot that begins a new map: its earlier one stays in the fused map until the new one has outgrown it."""
+"""A robot that begins a new map: its former ones stay in the fused map until the new one has outgrown them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ from pathlib import Path
 
 import pytest
 from fusion_running import GRID, keys, make_subset
+from opened_stores import OpenStore, opener
 
-from gausslite.domain.errors import InvalidInputError
-from gausslite.fusion.earlier_map import earlier_map_of
+from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.epochs import MAX_FORMER_MAPS, is_former
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import IN_MEMORY, SqliteStore
 from gausslite.fusion.store import FusionStore
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
-EARLIER = "ant:earlier"
+EARLIER = "ant:1"
+
+
+@pytest.fixture(params=["memory", "sqlite", "postgres"])
+def open_store(request: pytest.FixtureRequest) -> OpenStore:
+    return opener(request.param, request)
 
 
 def engine_on(store: FusionStore | None = None, **settings: object) -> FusionEngine:
@@ -27,8 +33,8 @@ def reboot(engine: FusionEngine, agent_id: str = "ant") -> str:
     return engine.join(agent_id, ANYTHING, fresh_map=True).session.session_id
 
 
-def send(engine: FusionEngine, session: str, seq: int, cells: dict[int, list[int]]) -> None:
-    engine.contribute(session, make_subset("ant", seq, cells), GRID)
+def send(engine: FusionEngine, session: str, seq: int, cells: dict[int, list[int]], agent_id: str = "ant") -> None:
+    engine.contribute(session, make_subset(agent_id, seq, cells), GRID)
 
 
 def fused_kappas(engine: FusionEngine) -> dict[int, int]:
@@ -65,7 +71,7 @@ def test_a_tombstone_of_the_new_map_leaves_the_earlier_one() -> None:
     assert fused_kappas(engine) == {0: 5, 1: 5}
 
 
-def test_of_many_maps_two_are_stored_and_the_best_of_each_voxel_stays() -> None:
+def test_of_many_maps_the_best_of_each_voxel_stays() -> None:
     engine = engine_on()
     for start in range(5):
         send(engine, reboot(engine), 1, {0: [10 - start], start + 1: [7]})
@@ -73,7 +79,7 @@ def test_of_many_maps_two_are_stored_and_the_best_of_each_voxel_stays() -> None:
         reboot(engine)
         reboot(engine)
     assert fused_kappas(engine) == {0: 10, **dict.fromkeys(range(1, 6), 7)}
-    assert [each.agent_id for each in engine.status().agents if each.voxels] == [EARLIER]
+    assert {each.agent_id for each in engine.status().agents if each.voxels} <= {f"ant:{epoch}" for epoch in range(20)}
 
 
 def test_watchers_get_what_a_new_map_changes() -> None:
@@ -82,6 +88,7 @@ def test_watchers_get_what_a_new_map_changes() -> None:
     revision = engine.maps.revision()
     session = reboot(engine)
     send(engine, session, 1, {1: [9]})
+    work(engine)
     changes = engine.maps.changes(revision)
     assert {name: sorted(won) for name, won in changes.won.keys_by_winner.items()} == {
         EARLIER: keys(0).tolist(),
@@ -115,5 +122,43 @@ def test_operators_delete_an_earlier_map_alone_or_with_its_agent() -> None:
     assert fused_kappas(engine) == {}
 
 
-def test_the_name_of_an_earlier_map_is_derived_from_its_agent() -> None:
-    assert earlier_map_of("ant") == EARLIER
+def work(engine: FusionEngine) -> None:
+    while engine.has_background_work:
+        engine.work_in_background()
+
+
+def test_former_maps_are_few_and_leave_in_slices(open_store: OpenStore) -> None:
+    store = open_store()
+    engine = engine_on(store)
+    for start in range(MAX_FORMER_MAPS + 2):
+        send(engine, reboot(engine), 1, {cell: [9] for cell in range(10 * start, 10 * start + start + 1)})
+    with pytest.raises(UnavailableError, match="former maps are being deleted"):
+        reboot(engine)
+    work(engine)
+    strongest = {cell: 9 for start in range(2, 9) for cell in range(10 * start, 10 * start + start + 1)}
+    assert strongest.items() <= fused_kappas(engine).items()
+    assert sum(is_former(name) for name in store.agents()) == MAX_FORMER_MAPS
+    if not isinstance(store, SqliteStore) or store._path != IN_MEMORY:
+        before = fused_kappas(engine)
+        store.close()
+        engine = engine_on(open_store())
+        assert fused_kappas(engine) == before
+    engine.evict("ant")
+    assert (engine.store.agents(), fused_kappas(engine)) == ((), {})
+    engine.store.close()
+
+
+def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = engine_on(memory_bytes=64 * 10_000)
+    send(engine, reboot(engine), 1, {cell: [9] for cell in range(50)})
+    with pytest.raises(QuotaError, match=r"at most 10000 bytes of memory \(memory-mb divided by quota-agents\)"):
+        send(engine, reboot(engine, "bee"), 1, {cell: [9] for cell in range(300)}, "bee")
+    session = reboot(engine)
+    # the former map makes room
+    with pytest.raises(UnavailableError, match="to make room"):
+        send(engine, session, 1, {cell: [1] for cell in range(50, 100)})
+    work(engine)
+    send(engine, session, 1, {cell: [1] for cell in range(50, 100)})
+    assert fused_kappas(engine) == dict.fromkeys(range(50, 100), 1)
+    monkeypatch.setattr("gausslite.fusion.limits._CONTAINER_LIMITS", ())
+    assert FusionSettings(grid=GRID).agent_bytes > 1 << 20

@@ -339,7 +339,7 @@ def _newer_schema(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, f"schema version {SCHEMA_VERSION}, got 77")]
+    ("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, f"to {SCHEMA_VERSION}, got 77")]
 )
 def test_a_damaged_or_newer_store_is_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], None], message: str

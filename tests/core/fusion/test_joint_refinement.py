@@ -153,8 +153,12 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     assert (len(pool), pool.count("ant"), pool.indices("ant"), pool.count("bee")) == (3, 2, (2, 3), 0)
     # the store keeps them for the next process
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
-    pool.remove_agent("ant")
-    assert len(pool) == 1
+    pool.begin_map("ant", store.begin_map("ant"))
+    assert (len(pool), pool.names()) == (1, [("aardvark", 7)])
+    # after a restart too
+    pool = KeyframePool(store, limits)
+    assert (len(pool), pool.names(), pool.has_former) == (1, [("aardvark", 7)], True)
+    assert [pool.remove_next() for _ in range(3)] == [True, True, False]
     assert {name: list(sizes) for name, sizes in store.keyframe_sizes().items()} == {"aardvark": [7]}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
         KeyframePool(store, Quotas(keyframe_pixels=1)).add(encoded("ant", 1))

@@ -12,6 +12,7 @@ from support.sample_batches import make_batch, random_subset
 
 from gausslite.codec.encoded_voxels import EncodedSubset, EncodedVoxels
 from gausslite.codec.subset_codec import decode_subset, encode_subset, unpack_subset
+from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion import update_log
 from gausslite.fusion.score_index import voxel_records
@@ -63,6 +64,9 @@ def require_latest(store: FusionStore, latest: Latest) -> None:
     assert set(batches) == {agent_id for agent_id, own in latest.items() if own}
     for agent_id, batch in batches.items():
         own = latest[agent_id]
+        scores = store.scores_of(agent_id, batch.keys)
+        kept, computed = store.digests(agent_id), TileDigests.of(batch.keys, scores["update_seqs"])
+        assert (kept.tiles.tolist(), kept.hashes.tolist()) == (computed.tiles.tolist(), computed.hashes.tolist())
         seqs = store.scores_of(agent_id, batch.keys)["update_seqs"].tolist()
         assert dict(zip(batch.keys.tolist(), rows_of(batch, seqs), strict=True)) == own
         some = np.array(sorted(own)[::2], np.int64)
@@ -115,7 +119,7 @@ def test_outdated_rows_are_deleted(open_store: OpenStore) -> None:
     log = store._log
     for seq in range(1, 80):
         store.put(random_subset("ant", seq, dict.fromkeys(range(seq % 3, 60, 3), 2), seed=seq))
-    held = sum(sum(tile.sizes.values()) for tile in log._tiles.values())
+    held = sum(tile.written for tile in log.index.tiles("ant").values())
     in_use = sum(2 + 2 for _ in range(60))
     assert held < 4 * in_use + 4 * 60
     store.close()

@@ -20,7 +20,6 @@ from gausslite.mapping.settings import (
     OptimizationSettings,
     SaturationSettings,
     SeedingSettings,
-    TaskChangeSettings,
 )
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
@@ -51,7 +50,6 @@ def map_with_another_size() -> object:
                 (SeedingSettings, {"opacity": 1.0}, ""),
                 (SeedingSettings, {"max_depth_m": 0.0}, ""),
                 (SeedingSettings, {"later_seeds": 0}, ""),
-                (TaskChangeSettings, {"keyframes_per_frame": 0}, ""),
                 (DensitySettings, {"densify_every": 0}, ""),
                 (DensitySettings, {"prune_every": -1}, ""),
                 (DensitySettings, {"min_opacity": math.nan}, ""),

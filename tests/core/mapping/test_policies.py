@@ -69,8 +69,8 @@ def test_the_paper_policy_has_the_settings_of_the_paper() -> None:
     assert (optimization.warmup_iterations, optimization.active_iterations, optimization.active_views) == (2, 6, 1)
     assert optimization.active_phase is ActivePhase.ACTIVE_ONLY
     assert optimization.loss == LossWeights(colour=0.8, depth=1.0, ssim=0.2, normalise_by_image=False)
-    assert (optimization.ema_updates, settings.adam) == (0.0, AdamSettings())
-    assert settings.adam.decay_after_updates == math.inf
+    assert (optimization.ema_updates, optimization.adam) == (0.0, AdamSettings())
+    assert optimization.adam.decay_after_updates == math.inf
     assert (settings.density.densify_every, settings.density.prune_every) == (150, 100)
     assert (settings.density.min_mean_gradient, settings.density.min_opacity) == (2e-4, 0.005)
     assert settings.pose_prior.is_exact

@@ -24,7 +24,6 @@ from gausslite.mapping.settings import (
     KeyframeSettings,
     MapperSettings,
     SeedingSettings,
-    TaskChangeSettings,
 )
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
@@ -47,7 +46,6 @@ def make_task_mapper(max_gaussians: int = 1500, every: int = 1, buffer: int = 8,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
         keyframes=KeyframeSettings(every=every, window=window, buffer=buffer, long_term_keyframes=2),
         density=DensitySettings(densify_every=7, prune_every=5),
-        task_change=TaskChangeSettings(keyframes_per_frame=2),
     )
     return TaskMapper(A, GaussianMapper(settings, CpuRasterizer(threads=1)), SentVoxelTracker(GRID))
 
@@ -87,8 +85,8 @@ def test_each_frame_reevaluates_a_bounded_number_of_keyframes_until_all_are_done
     outcomes = map_frames(task_mapper, 8, 16)
     settings = SeedingSettings(first_frame_seeds=60_000)
     max_seeds = settings.roi_share * settings.first_frame_seeds * SIZE[0] * SIZE[1] / (640 * 480)
-    assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 2, 2, 2, 0, 0, 0, 0]
-    assert all(outcome.reevaluation.seeded <= 2 * max_seeds for outcome in outcomes)
+    assert [outcome.reevaluation.keyframes for outcome in outcomes] == [3, 3, 2, 0, 0, 0, 0, 0]
+    assert all(outcome.reevaluation.seeded <= 3 * max_seeds for outcome in outcomes)
     assert outcomes[0].reevaluation.seeded > 0
 
 
@@ -156,7 +154,7 @@ def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
     trained = []
     for index in range(12, 18):
         trained.append(task_mapper.process(wall_frame(index, SIZE, shift_m=-1.1)))
-        assert len(mapper.store.window) <= 3 + 2 * 2
+        assert len(mapper.store.window) <= 3 + 2 * 3
     assert mapper.store.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
     assert any(view.shows_roi for view in mapper.store.window)

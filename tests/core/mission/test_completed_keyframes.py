@@ -13,7 +13,7 @@ from gausslite.domain.relevance import BallRegion, Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import visible_means
-from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings, TaskChangeSettings
+from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator
@@ -43,7 +43,6 @@ def make_task_mapper() -> TaskMapper:
         max_gaussians=2500,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
         keyframes=KeyframeSettings(every=1, window=3, buffer=8, long_term_keyframes=4),
-        task_change=TaskChangeSettings(keyframes_per_frame=2),
     )
     tracking = RelevanceTrackerSettings(max_frames=1)
     estimator = TaskRelevanceEstimator(GRAPH, LateDetector({"mug": MUG}), tracking)
@@ -60,7 +59,7 @@ def test_earlier_keyframes_get_the_mask_and_their_gaussians_become_active() -> N
     assert [keyframe.relevance.roi.any() for keyframe in task_mapper.keyframes()] == 4 * [False] + 2 * [True]
     assert all(outcome.reevaluation.completed == 0 for outcome in before)
     after = map_frames(task_mapper, KNOWN, 10)
-    assert [outcome.reevaluation.completed for outcome in after] == [2, 2, 2, 0]
+    assert [outcome.reevaluation.completed for outcome in after] == [3, 3, 0, 0]
     assert sum(outcome.reevaluation.seeded for outcome in after) > 0
     for keyframe in task_mapper.keyframes():
         truth = MUG.mask(keyframe.frame)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from call_context import Context
 from certificates import identity, make_certificates
 from fusion_running import GRID, fusion_server, make_subset, request
 from serving import serving
@@ -131,19 +132,6 @@ def test_without_certificates_only_this_machine_evicts() -> None:
     with fusion_server() as t:
         t.client.join("ant", GRID)
         assert t.client.evict("ant", ban=True) == 0
-
-
-class Context:
-    """The two methods of a call's context that state its caller, with values as gRPC gives them."""
-
-    def __init__(self, peer: str, **properties: bytes) -> None:
-        self._peer, self._properties = peer, properties
-
-    def peer(self) -> str:
-        return self._peer
-
-    def auth_context(self) -> dict[str, list[bytes]]:
-        return {name: [value] for name, value in self._properties.items()}
 
 
 @pytest.mark.parametrize(

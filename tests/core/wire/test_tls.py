@@ -32,7 +32,7 @@ _FILES = (("cert", "server/cert.pem"), ("key", "server/key.pem"), ("ca", "server
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_certificates(tmp_path_factory.mktemp("certs"), "server", "husky-1", "husky-2")
+    return make_certificates(tmp_path_factory.mktemp("certs"), "server", "husky-1", "husky-2", "away:none:127.0.0.2")
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +76,11 @@ def test_a_server_with_another_name_is_refused(certs: Path, tmp_path: Path) -> N
         pytest.raises(UnavailableError),
     ):
         client.parse("Pick up the mug")
+    with (
+        serving([parser_service(RuleParser())], "127.0.0.2:0", identity(certs, "away")) as elsewhere,
+        ParserClient(elsewhere.address, tls=identity(certs, "husky-1")) as client,
+    ):
+        assert client.parse("Pick up the mug").targets == ("mug",)
 
 
 def test_a_robot_can_only_act_for_its_own_agent_id(certs: Path) -> None:

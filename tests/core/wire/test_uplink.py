@@ -25,7 +25,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.spool import Purpose, Spool, SpooledKeyframe
 from gausslite.wire.update_sender import UplinkSettings
 
 
@@ -171,35 +171,33 @@ def test_a_voxel_that_lost_a_quarter_of_its_kappa_is_sent_at_once() -> None:
     spool.close()
 
 
-def test_a_spool_of_an_earlier_version_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "spool.sqlite"
-    spool = Spool(path, "robot", GRID)
-    assert _send_due(spool, 10)
-    spool.close()
-    with closing(sqlite3.connect(path)) as database:
-        database.execute("ALTER TABLE voxel_updates DROP COLUMN sends")
-    spool = Spool(path, "robot", GRID)
-    assert [_send_due(spool, kappa) for kappa in (14, 15)] == [False, True]
-    spool.close()
+_NO_CHECKSUMS = "; ".join(f"ALTER TABLE {table} DROP COLUMN checksum" for table in ("voxel_updates", "keyframes"))
+_NO_ORDER = f"{_NO_CHECKSUMS}; DROP INDEX voxel_updates_by_value; ALTER TABLE voxel_updates DROP COLUMN place"
 
 
-def test_what_was_acknowledged_to_a_spool_of_an_earlier_version_is_known(tmp_path: Path) -> None:
+@pytest.mark.parametrize("earlier", [_NO_CHECKSUMS, _NO_ORDER])
+def test_a_spool_of_the_two_versions_before_goes_on(tmp_path: Path, earlier: str) -> None:
     path, batch = tmp_path / "spool.sqlite", make_batch({1: [5], 2: [6]})
     spool = Spool(path, "robot", GRID)
     spool.enqueue(batch, Purpose.ROI)
     spool.record_acknowledged(batch.keys[:1], 7)
-    expected = spool.acknowledged_digests()
+    spool.enqueue_keyframe(SpooledKeyframe(1, 2.0, b"c", b"image"))
+    expected, keyframes = spool.acknowledged_digests(), spool.keyframes()
+    assert _send_due(spool, 10)
     spool.close()
     with closing(sqlite3.connect(path)) as database:
-        database.execute("ALTER TABLE voxel_updates DROP COLUMN acknowledged_seq")
-        database.execute("CREATE TABLE sent_updates (key INTEGER PRIMARY KEY, update_seq INTEGER NOT NULL)")
-        database.execute("INSERT INTO sent_updates VALUES (?, 7)", (int(batch.keys[0]),))
-        database.commit()
-    for _ in range(2):
+        database.executescript(earlier)
+    for kappa in (14, 15):
         spool = Spool(path, "robot", GRID)
         found = spool.acknowledged_digests()
         assert (found.tiles.tolist(), found.hashes.tolist()) == (expected.tiles.tolist(), expected.hashes.tolist())
+        assert spool.keyframes() == keyframes
+        assert _send_due(spool, kappa) == (kappa == 15)
         spool.close()
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(f"{_NO_ORDER}; ALTER TABLE voxel_updates DROP COLUMN acknowledged_seq")
+    with pytest.raises(StorageError, match="of another release; let that one send it"):
+        Spool(path, "robot", GRID)
 
 
 def test_limit_drain_ends_a_drain_that_has_begun() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -44,6 +45,7 @@ def test_after_a_restart_with_a_store_that_has_lost_its_newest_updates(tmp_path:
     first, path = SqliteStore(tmp_path / "first.sqlite"), tmp_path / "second.sqlite"
     with sqlite3.connect(tmp_path / "first.sqlite") as source, sqlite3.connect(path) as copy:
         source.backup(copy)
+    shutil.copy(tmp_path / "first.sqlite-head", tmp_path / "second.sqlite-head")
     # the same incarnation, as after the loss of the log
     second = SqliteStore(path)
     assert second.incarnation_id == first.incarnation_id

@@ -47,6 +47,7 @@ from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import AgentSettings, parse_arguments
 from gausslite_agent.state import EndRequest, MissionState
 from gausslite_language.rules import RuleParser
+from gausslite_view.decoding import stored_keyframe_from_message
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
@@ -148,7 +149,7 @@ def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
         keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
-        stored = fusion.client.keyframe(agent.agent_id)
+        stored = stored_keyframe_from_message(fusion.client.keyframe(agent.agent_id))
     assert stored is not None
     assert stored.roi is not None
     np.testing.assert_array_equal(stored.roi, keyframes[-1].relevance.roi)

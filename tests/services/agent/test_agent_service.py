@@ -6,8 +6,10 @@ import asyncio
 import gc
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from unittest.mock import patch
 
 import grpc
 import numpy as np
@@ -22,6 +24,8 @@ from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
     ModelFileError,
+    QuotaError,
+    RateLimitError,
     RevisionGoneError,
     TaskError,
 )
@@ -42,6 +46,7 @@ from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.servicer import MapChangeLog, NewestTask
 from gausslite_language.rules import RuleParser
+from gausslite_view.decoding import camera_view_from_message
 
 
 def test_a_task_is_text_or_a_graph() -> None:
@@ -323,12 +328,33 @@ def test_render_view_shows_the_map() -> None:
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(1.2, abs=0.1)
 
 
+def test_views_wait_for_frames_and_are_refused_by_name_without_time_for_them() -> None:
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event())
+    with ThreadPoolExecutor() as viewer, agent(lambda _graph: gate) as a:
+        a.client.assign_task(TASK)
+        a.worker.submit(frame(0))
+        assert gate.reached.wait(20)
+        viewed = viewer.submit(a.worker.run_when_idle, lambda _mapper: a.worker.status().mapped)
+        wait_until(lambda: a.worker._worker._work_queue.qsize() > 0)
+        for index in (1, 2):
+            a.worker.submit(frame(index))
+        gate.opened.set()
+        assert viewed.result(20) == 3
+        with (
+            patch("gausslite_agent.mapping_worker._IDLE_WAIT_S", 0.0),
+            pytest.raises(RateLimitError, match="views: expected time left after mapping, got none within 0 s"),
+        ):
+            a.client.render(CAMERA, np.eye(4))
+        with pytest.raises(QuotaError, match="at most 2073600 pixels, got 6000000"):
+            a.client.render(replace(CAMERA, width_px=3000, height_px=2000), np.eye(4))
+
+
 def test_the_camera_view_shows_the_newest_keyframe_and_the_path() -> None:
     with agent() as a:
-        assert a.client.camera_view() is None
+        assert camera_view_from_message(a.client.camera_view()) is None
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(index) for index in range(3)]))
-        view = a.client.camera_view()
+        view = camera_view_from_message(a.client.camera_view())
     assert view is not None
     assert view.camera == CAMERA
     assert np.abs(view.rgb.astype(int) - frame(view.frame_index).rgb).mean() < 5

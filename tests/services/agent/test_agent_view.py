@@ -23,6 +23,7 @@ pytest.importorskip("viser")
 from page_controls import SeenPage, plot, poll_until
 
 from gausslite_view.agent_panel import AgentPanel
+from gausslite_view.decoding import camera_view_from_message
 
 
 def write(tab: Any, number: int, text: str) -> None:
@@ -68,7 +69,7 @@ def test_the_newest_detection_is_drawn_over_its_image_in_a_browser():
     ):
         running.client.assign_task("Find the mug")
         next(running.client.ingest([frame(0)]))
-        detected = running.client.camera_view().detected
+        detected = camera_view_from_message(running.client.camera_view()).detected
         assert (detected.index, [box.phrase for box in detected.boxes]) == (0, ["mug"])
         tab = browser.new_page()
         tab.goto(url)
@@ -106,7 +107,7 @@ def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe():
             poll_until(panel.poll, lambda: len(page.contents.gaussians) > 0)
             rendered, _ = client.render(frame(0).camera, frame(0).T_world_camera)
             full_db = plot(page, "training PSNR, full image (dB)")["dB"][0]
-            assert full_db == pytest.approx(psnr(rendered, client.camera_view().rgb), abs=1.0)
+            assert full_db == pytest.approx(psnr(rendered, camera_view_from_message(client.camera_view()).rgb), abs=1.0)
         finally:
             panel.close()
             page.close()

@@ -24,6 +24,7 @@ from page_controls import SeenPage, control, images, plot, poll_until, text
 
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import encode_mask, frame_to_message
+from gausslite_view.decoding import stored_keyframe_from_message
 from gausslite_view.fusion_panel import FusionPanel
 
 WAIT_S = 60.0
@@ -150,7 +151,7 @@ def test_a_region_of_another_size_is_refused():
         bad.region_png = encode_mask(np.zeros((7, 9), np.bool_))
         response = running.client.contribute_encoded_keyframes(session, [good, bad])
         assert (response.accepted, [each.index for each in response.rejected]) == (1, [1])
-        keyframe = running.client.keyframe("a")
+        keyframe = stored_keyframe_from_message(running.client.keyframe("a"))
         assert (keyframe.index, float(keyframe.roi.mean())) == (0, 0.25)
 
 
@@ -211,12 +212,12 @@ def test_a_stored_keyframe_is_read_by_its_index():
     with fusion_server() as running:
         session = running.client.join("a", GRID, T_fused_agent=moved_x(2.0)).session_id
         running.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)])
-        keyframe = running.client.keyframe("a", 3)
+        keyframe = stored_keyframe_from_message(running.client.keyframe("a", 3))
         assert (keyframe.index, keyframe.indices, keyframe.camera) == (3, (3, 8), coloured_frame(3, 40).camera)
         np.testing.assert_allclose(keyframe.T_world_camera[:3, 3], [2.3, 0.0, 0.0])
-        assert running.client.keyframe("b") is None
+        assert stored_keyframe_from_message(running.client.keyframe("b")) is None
         with pytest.raises(InvalidInputError, match="a keyframe of a, such as 8, got 4"):
-            running.client.keyframe("a", 4)
+            stored_keyframe_from_message(running.client.keyframe("a", 4))
 
 
 def moved_x(distance_m: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from threading import Event
 from unittest.mock import patch
 
 import grpc
@@ -24,7 +25,9 @@ from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.refinement import MapRenderer
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.channel import require_serving
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
+from gausslite.wire.views import MAX_VIEWS_WAITING, view_to_pngs
 from gausslite_fusion_server import servicer
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import SurfaceSamples, fit_frame
@@ -65,6 +68,28 @@ def test_hostile_views_are_refused() -> None:
             server.stub.RenderView(pb.RenderFusedViewRequest(mission_id="another", **good))
         assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
         assert isinstance(CAMERA, Camera)
+
+
+def test_the_event_loop_answers_while_views_wait_and_too_many_are_refused_by_name() -> None:
+    rendering, released = Event(), Event()
+
+    def render(*_: object) -> tuple[None, int]:
+        rendering.set()
+        assert released.wait(20)
+        return None, 1
+
+    view = pb.RenderFusedViewRequest(camera=camera_to_message(CAMERA), t_world_camera=transform_to_message(np.eye(4)))
+    with patch.object(MapRenderer, "render", render), fusion_server() as server:
+        calls = [server.stub.RenderView.future(view) for _ in range(MAX_VIEWS_WAITING + 2)]
+        assert rendering.wait(20)
+        wait_until(lambda: any(call.done() for call in calls))
+        [refused] = [call for call in calls if call.done()]
+        assert refused.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert f"views: expected at most {MAX_VIEWS_WAITING} calls that wait" in refused.details()
+        require_serving(server.client.address, None)
+        assert not server.client.status().agents
+        released.set()
+        assert all(call.result(20).revision == 1 for call in calls if call is not refused)
 
 
 def test_watchers_follow_the_refined_layer() -> None:
@@ -143,12 +168,12 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
             # a view of the other layer in between costs no copy of this one
             renderer.render(CAMERA, np.eye(4), MapLayer.VOTE)
             read.reset_mock()
-            shown = renderer.render(CAMERA, np.eye(4), MapLayer.REFINED)
+            shown, _ = renderer.render(CAMERA, np.eye(4), MapLayer.REFINED)
             assert read.call_count == tiles
-            alone = MapRenderer(engine.maps, ReferenceRasterizer).render(CAMERA, np.eye(4), MapLayer.VOTE)
-            assert np.array_equal(shown.rgb, alone.rgb)
-            assert np.array_equal(shown.depth_m, alone.depth_m)
-    assert not shown.rgb.any()
+            alone, _ = MapRenderer(engine.maps, ReferenceRasterizer).render(CAMERA, np.eye(4), MapLayer.VOTE)
+            pngs, of_alone = (view_to_pngs(CAMERA, rendering) for rendering in (shown, alone))
+            assert pngs == of_alone
+    assert shown is None
 
 
 @pytest.mark.slow

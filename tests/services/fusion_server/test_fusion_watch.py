@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from unittest.mock import Mock
 
 import pytest
+from call_context import Context
 from fusion_running import GRID, keys, make_subset
 from torch_oracle.rasterizer import ReferenceRasterizer
 
@@ -35,7 +36,7 @@ def watching(settings: FusionSettings, body: Callable[[AsyncIterator[MapBlock], 
         engine = FusionEngine(SqliteStore(), settings, first_revision=1)
         servicer = FusionServicer(engine, RefinementWorker(RefineSettings(), ReferenceRasterizer))
         session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
-        responses = servicer.WatchFusedMap(pb.WatchFusedMapRequest(), None)
+        responses = servicer.WatchFusedMap(pb.WatchFusedMapRequest(), Context("unix:"))
 
         async def blocks() -> AsyncIterator[MapBlock]:
             async for response in responses:
@@ -86,8 +87,10 @@ def test_a_watcher_that_missed_too_much_gets_a_snapshot() -> None:
 def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch) -> None:
     engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID), first_revision=1)
     session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
-    cache, part = EncodedPartCache(), WatchedPart(MapLayer.VOTE)
-    readers = [FusedMapReader(engine, part, cache) for _ in range(20)]
+    cache = EncodedPartCache()
+    # those that exclude an agent without voxels share with the others
+    excluded = [f"bee-{number}" for number in range(19)]
+    readers = [FusedMapReader(engine, WatchedPart(MapLayer.VOTE, None, name), cache) for name in ("", *excluded)]
     before, _ = readers[0].snapshot()
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
     monkeypatch.setattr(FusedMapLayers, "changes", Mock(wraps=engine.maps.changes))
@@ -99,8 +102,8 @@ def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch)
 def test_watchers_that_follow_closely_share_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
     engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID), first_revision=1)
     session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
-    cache, part = EncodedPartCache(), WatchedPart(MapLayer.VOTE)
-    early, late = (FusedMapReader(engine, part, cache) for _ in range(2))
+    cache = EncodedPartCache()
+    early, late = (FusedMapReader(engine, WatchedPart(MapLayer.VOTE, None, name), cache) for name in ("", "bee"))
     before, _ = early.snapshot()
     monkeypatch.setattr(FusedMapLayers, "changes", Mock(wraps=engine.maps.changes))
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)

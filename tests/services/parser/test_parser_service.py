@@ -130,10 +130,12 @@ def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> 
 
     with serving([parser_service(RuleParser())]) as server:
         assert main([server.address]) == 0
+        assert main([server.address, "liveness"]) == 0
+        assert main([server.address, "other"]) == 1
     assert main([server.address]) == 1
     with pytest.raises(SystemExit) as usage_error:
         main([])
     assert usage_error.value.code == 2
-    refused, usage = capsys.readouterr().err.splitlines()
-    assert server.address in refused
+    *refusals, usage = capsys.readouterr().err.splitlines()
+    assert [server.address in line for line in refusals] == [True, True]
     assert "the following arguments are required: HOST:PORT|unix:PATH" in usage

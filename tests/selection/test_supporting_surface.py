@@ -12,7 +12,7 @@ from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings
-from gausslite.perception.supporting_surface import FloorLevel, level_under_m, nouns_known_by_height, stands_on
+from gausslite_selection.supporting_surface import FloorLevel, level_under_m, nouns_known_by_height, stands_on
 
 UP = np.array([0.0, 0.0, 1.0])
 CAMERA = Camera(200.0, 200.0, 120.0, 90.0, 240, 180)

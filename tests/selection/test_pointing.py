@@ -13,8 +13,8 @@ from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector import RegionDetector
-from gausslite.perception.pointing import mask_on_image, region_at, region_on_image
 from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite_selection.pointing import mask_on_image, region_at, region_on_image
 
 
 @pytest.fixture(scope="module")

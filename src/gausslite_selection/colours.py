@@ -9,22 +9,26 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from enum import Enum
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.frame import linear_light
+from gausslite.domain.frame import Frame, linear_light
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.nouns import words
+from gausslite.perception.selector import Fit
+from gausslite_selection.words import words
 
 _MIN_NAMED_SHARE = 0.3
 """From this share in ranges that a word names, the object is of the colour."""
 _MIN_POSSIBLE_SHARE = 0.12
 """Below this share in ranges that a word could name, it is not."""
 
+_MIN_INNER_PIXELS = 20
+"""Pixels inside the outline from which they alone give an object's colours."""
+_MAX_COLOUR_PIXELS = 500
 _ANY: Final = (-np.inf, np.inf)
 
 
@@ -71,17 +75,16 @@ _OKLAB_OF_CONES: Final = np.array(
 )
 
 
-class ColourMatch(Enum):
-    """Whether an object has the colour of a word."""
-
-    YES = "yes"
-    DOUBTFUL = "doubtful"
-    NO = "no"
-
-
 def colour_counts(rgb: UInt8[ndarray, "n 3"]) -> Float64[ndarray, "balances ranges"]:
     """Return the share of the pixels in each range of colours, for each white balance; zeros without pixels."""
     return np.stack([_range_shares(rgb.astype(np.float64) * gains) for gains in words()["colours"]["white_balances"]])
+
+
+def mask_colours(mask: Bool[ndarray, "h w"], frame: Frame) -> Float64[ndarray, "balances ranges"]:
+    """Return the `colour_counts` of a mask's pixels, without its outline, which mixes with what is behind."""
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    pixels = frame.rgb[inner if np.count_nonzero(inner) >= _MIN_INNER_PIXELS else mask]
+    return colour_counts(pixels[:: max(1, len(pixels) // _MAX_COLOUR_PIXELS)])
 
 
 def no_colours() -> Float64[ndarray, "balances ranges"]:
@@ -94,7 +97,7 @@ def is_evaluated(colour: str) -> bool:
     return all(_terms_of(word) for word in colour.split(" and "))
 
 
-def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"]) -> ColourMatch:
+def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"]) -> Fit:
     """Return whether an object with these sums of `colour_counts` has the colour.
 
     YES: ranges that the word names have 0.3 of the pixels, as the camera shows them. NO: ranges that it could name have
@@ -103,20 +106,20 @@ def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"]) -> Co
     """
     total = float(counts[0].sum())
     if total == 0.0 or not is_evaluated(colour):
-        return ColourMatch.DOUBTFUL
+        return Fit.DOUBTFUL
     matches = [_match_terms(_terms_of(word), counts / total) for word in colour.split(" and ")]
-    if ColourMatch.NO in matches:
-        return ColourMatch.NO
-    return ColourMatch.YES if all(match is ColourMatch.YES for match in matches) else ColourMatch.DOUBTFUL
+    if Fit.NO in matches:
+        return Fit.NO
+    return Fit.YES if all(match is Fit.YES for match in matches) else Fit.DOUBTFUL
 
 
-def _match_terms(terms: frozenset[str], shares: Float64[ndarray, "balances ranges"]) -> ColourMatch:
+def _match_terms(terms: frozenset[str], shares: Float64[ndarray, "balances ranges"]) -> Fit:
     is_named = np.array([not terms.isdisjoint(colours.named) for colours in _ranges()])
     if float(shares[0, is_named].sum()) >= _MIN_NAMED_SHARE:
-        return ColourMatch.YES
+        return Fit.YES
     is_possible = np.array([not terms.isdisjoint(colours.possible) for colours in _ranges()])
     possible = float(shares[:, is_possible].sum(axis=1).max())
-    return ColourMatch.NO if possible < _MIN_POSSIBLE_SHARE else ColourMatch.DOUBTFUL
+    return Fit.NO if possible < _MIN_POSSIBLE_SHARE else Fit.DOUBTFUL
 
 
 def _terms_of(word: str) -> frozenset[str]:
@@ -163,20 +166,18 @@ class ColourFilter:
         self._excluded_everywhere = tuple(name for name in excluded if noun_of(name) not in named)
         self._names = tuple(name for name in self._colours if name not in graph.excluded)
 
-    def match(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> ColourMatch:
+    def match(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> Fit:
         """Return whether an object with these counts has the colour of a name; YES for a name without a colour."""
         colour = self._colours.get(name)
-        return ColourMatch.YES if colour is None else match_colour(colour, counts)
+        return Fit.YES if colour is None else match_colour(colour, counts)
 
     def allows(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> bool:
         """Return False if the colour of an object clearly differs from that of a name."""
-        return self.match(name, counts) is not ColourMatch.NO
+        return self.match(name, counts) is not Fit.NO
 
     def is_excluded(self, noun: str, counts: Float64[ndarray, "balances ranges"]) -> bool:
         """Return True if an object of a target's noun clearly has the colour of an excluded object of this noun."""
-        return any(
-            noun == excluded and match_colour(colour, counts) is ColourMatch.YES for excluded, colour in self._excluded
-        )
+        return any(noun == excluded and match_colour(colour, counts) is Fit.YES for excluded, colour in self._excluded)
 
     def label(self, name: str) -> str:
         """Return the noun of a name with its colour."""
@@ -187,7 +188,7 @@ class ColourFilter:
         lines = [self._describe(name, seen) for name in self._names]
         for noun, colour in self._excluded:
             matches = [match_colour(colour, counts) for other, counts in seen if other == noun]
-            doubtful = matches.count(ColourMatch.DOUBTFUL)
+            doubtful = matches.count(Fit.DOUBTFUL)
             if doubtful:
                 lines.append(f"excluded {colour} {noun!r}: {doubtful} of {len(matches)} objects may be one, and count")
         lines += [
@@ -201,7 +202,7 @@ class ColourFilter:
         if not is_evaluated(colour):
             return f"{colour} {noun!r}: this colour is not evaluated, every {noun!r} counts"
         matches = [self.match(name, counts) for other, counts in seen if other == noun]
-        other, doubtful = matches.count(ColourMatch.NO), matches.count(ColourMatch.DOUBTFUL)
+        other, doubtful = matches.count(Fit.NO), matches.count(Fit.DOUBTFUL)
         parts = []
         if other:
             parts.append(f"{other} of {len(matches)} objects of another colour do not count")

@@ -8,7 +8,7 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.perception.depth_segmenter import DepthSegmenter, DepthSegmenterSettings
+from gausslite_detectors.depth_segmenter import DepthSegmenter, DepthSegmenterSettings
 
 BOX = np.array([[30, 20, 70, 60]], np.float32)
 THING = (slice(25, 55), slice(35, 65))

@@ -13,7 +13,8 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Detection
-from gausslite.perception.detector import BoxSizeLimits, Tile, TiledDetector, Tiling, crop, tiles_of
+from gausslite_detectors.boxes import BoxSizeLimits
+from gausslite_detectors.tiles import Tile, TiledDetector, Tiling, crop, tiles_of
 
 HEIGHT_PX, WIDTH_PX = 60, 80
 INPUT_WIDTH_PX = 80

@@ -8,8 +8,8 @@ import pytest
 import gausslite as gl
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
-from gausslite_language.questions import answer
 from gausslite_language.rules import RuleParser
+from gausslite_selection.questions import answer
 
 
 def thing(name: str, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> ObjectLandmark:

@@ -11,7 +11,8 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.relevance import CameraView, DetectedBox, DetectedImage
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.views import camera_view_from_message, camera_view_to_message
+from gausslite.wire.views import camera_view_to_message
+from gausslite_view.decoding import camera_view_from_message
 
 CAMERA = Camera(30.0, 30.0, 16.0, 12.0, 32, 24)
 

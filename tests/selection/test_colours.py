@@ -12,10 +12,11 @@ from tool_modules import load_tool
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, TaskGraph
-from gausslite.perception.colours import ColourMatch, basic_terms, colour_counts, is_evaluated, match_colour, no_colours
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.selector import Fit
 from gausslite_detectors.models import READER
+from gausslite_selection.colours import basic_terms, colour_counts, is_evaluated, match_colour, no_colours
 
 # colours that every table of colour names gives these names
 FOCAL = {
@@ -33,7 +34,7 @@ FOCAL = {
 }
 
 
-def match_word(word: str, counts: np.ndarray) -> ColourMatch:
+def match_word(word: str, counts: np.ndarray) -> Fit:
     return match_colour(word, counts)
 
 
@@ -44,9 +45,9 @@ def counts_of(*rgb: tuple[int, int, int]) -> np.ndarray:
 @pytest.mark.parametrize("word", basic_terms())
 def test_each_basic_colour_is_surely_itself_and_no_opposite(word):
     matches = {term: match_word(term, counts_of(FOCAL[word])) for term in basic_terms()}
-    assert matches[word] is ColourMatch.YES
-    assert [term for term, match in matches.items() if match is ColourMatch.YES] == [word]
-    assert list(matches.values()).count(ColourMatch.NO) >= 6
+    assert matches[word] is Fit.YES
+    assert [term for term, match in matches.items() if match is Fit.YES] == [word]
+    assert list(matches.values()).count(Fit.NO) >= 6
 
 
 @pytest.mark.parametrize("word", ["red", "orange", "yellow", "green", "blue", "purple", "brown"])
@@ -54,27 +55,27 @@ def test_each_basic_colour_is_surely_itself_and_no_opposite(word):
 def test_shading_does_not_exclude_a_colour(word, brightness):
     """Half the surface is in a shadow that scales the light; pixels have the gamma of sRGB."""
     shaded = tuple(int(255 * ((channel / 255) ** 2.2 * brightness) ** (1 / 2.2)) for channel in FOCAL[word])
-    assert match_word(word, counts_of(FOCAL[word], shaded)) is ColourMatch.YES
-    assert match_word(word, counts_of(shaded)) is not ColourMatch.NO
+    assert match_word(word, counts_of(FOCAL[word], shaded)) is Fit.YES
+    assert match_word(word, counts_of(shaded)) is not Fit.NO
 
 
 @pytest.mark.parametrize("gains", [(1.12, 1.0, 0.9), (0.9, 1.0, 1.12)])
 def test_a_wrong_white_balance_does_not_exclude_a_colour(gains):
     for word, rgb in FOCAL.items():
         seen = tuple(int(min(255, channel * gain)) for channel, gain in zip(rgb, gains, strict=True))
-        assert match_word(word, counts_of(seen)) is not ColourMatch.NO, word
+        assert match_word(word, counts_of(seen)) is not Fit.NO, word
 
 
 def test_words_with_shades_two_colours_and_unknown_words():
     blue, striped = counts_of(FOCAL["blue"]), counts_of(FOCAL["black"], FOCAL["white"])
-    assert match_word("light blue", blue) is ColourMatch.YES
-    assert match_word("navy", blue) is ColourMatch.YES
-    assert match_word("black and white", striped) is ColourMatch.YES
-    assert match_word("black and white", counts_of(FOCAL["black"])) is ColourMatch.NO
-    assert match_word("teal", blue) is ColourMatch.YES
+    assert match_word("light blue", blue) is Fit.YES
+    assert match_word("navy", blue) is Fit.YES
+    assert match_word("black and white", striped) is Fit.YES
+    assert match_word("black and white", counts_of(FOCAL["black"])) is Fit.NO
+    assert match_word("teal", blue) is Fit.YES
     assert (is_evaluated("dark grey"), is_evaluated("transparent")) == (True, False)
-    assert match_word("transparent", blue) is ColourMatch.DOUBTFUL
-    assert match_word("blue", no_colours()) is ColourMatch.DOUBTFUL
+    assert match_word("transparent", blue) is Fit.DOUBTFUL
+    assert match_word("blue", no_colours()) is Fit.DOUBTFUL
 
 
 def test_no_right_colour_of_a_simulated_home_is_excluded():
@@ -82,8 +83,8 @@ def test_no_right_colour_of_a_simulated_home_is_excluded():
     scores = load_tool("score_colours").score([4], 3, "240x180", (1.0, 1.0, 1.0))
     right, wrong = ([getattr(each, side) for each in scores.values()] for side in ("right", "wrong"))
     assert sum(sum(each.values()) for each in right) >= 8
-    assert sum(each[ColourMatch.NO] for each in right) == 0
-    assert sum(each[ColourMatch.NO] for each in wrong) >= 0.6 * sum(sum(each.values()) for each in wrong)
+    assert sum(each[Fit.NO] for each in right) == 0
+    assert sum(each[Fit.NO] for each in wrong) >= 0.6 * sum(sum(each.values()) for each in wrong)
 
 
 def frame(index: int, left=FOCAL["red"], right=FOCAL["blue"]) -> Frame:

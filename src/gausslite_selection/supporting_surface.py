@@ -7,19 +7,21 @@ The plane under an object has a height above the floor, and each kind of furnitu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
+from gausslite.domain.state import State, get_array
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
-from gausslite.nouns import head_of, words
+from gausslite.nouns import head_of
 from gausslite.perception.detector import bounding_box
-from gausslite.perception.object_map import Landmark, Observation
-from gausslite.perception.surface import window_points_m
+from gausslite.perception.surface import SurfaceVotes, window_points_m
+from gausslite_selection.words import words
 
 _LEVEL_BIN_M = 0.025
 _LEVEL_REACH_M = 4.0
@@ -44,6 +46,7 @@ _MAX_STANDING_M = 0.06
 """Height of an object's lowest point up to which it stands on the floor."""
 _LOWEST_PERCENTILE = 0.5
 """Share of a surface's voxels, in percent, below its lowest point."""
+_OTHER_NAMES = (MatchBasis.SYNONYM, MatchBasis.KIND, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR)
 
 
 class SupportingSurfaces:
@@ -71,19 +74,20 @@ class SupportingSurfaces:
         if self._anchors:
             self.floor = self.floor.add(frame, self.up)
 
-    def with_level(self, observation: Observation, mask: Bool[ndarray, "h w"], frame: Frame) -> Observation:
-        """Return the observation with the level of the plane under it, if a relation needs it."""
-        if not self._anchors:
-            return observation
-        level_m = level_under_m(mask, frame, self.up)
-        return replace(observation, levels_m=np.array([level_m])) if np.isfinite(level_m) else observation
+    @property
+    def are_needed(self) -> bool:
+        """True if a relation needs levels of planes under objects."""
+        return bool(self._anchors)
 
-    def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
-        """Return whether an object stands on the relation's anchor by its height; None if heights do not decide."""
+    def stands_on(self, relation: Relation, votes: SurfaceVotes, levels_m: Float64[ndarray, " s"]) -> bool | None:
+        """Return whether an object stands on the relation's anchor by its height; None if heights do not decide.
+
+        votes: of its masks, on its surface. levels_m: of planes seen under it.
+        """
         if not self.is_by_height(relation):
             return None
-        bottom_m = seen.votes.lowest_m(self.up, _LOWEST_PERCENTILE)
-        return stands_on(noun_of(relation.anchor), seen.levels_m, self.floor.level_m, bottom_m)
+        bottom_m = votes.lowest_m(self.up, _LOWEST_PERCENTILE)
+        return stands_on(noun_of(relation.anchor), levels_m, self.floor.level_m, bottom_m)
 
 
 def level_under_m(mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarray, "3"]) -> float:
@@ -144,6 +148,20 @@ class FloorLevel:
         bins = np.floor(from_lowest_m / _LEVEL_BIN_M).astype(np.int64)
         inside = bins[(bins >= 0) & (bins < len(self.counts))]
         return FloorLevel(first_m, self.counts + np.bincount(inside, minlength=len(self.counts)))
+
+    def state(self) -> State:
+        """Return the counts as named arrays."""
+        levels_m = [] if self.first_camera_m is None else [self.first_camera_m]
+        return {"floor_counts": self.counts, "first_camera_m": np.array(levels_m, np.float64)}
+
+    @classmethod
+    def decode(cls, state: State) -> FloorLevel:
+        """Return the counts of a state. Raises MapFileError."""
+        counts = get_array(state, "floor_counts", cls.before_frames().counts.shape, np.int64).copy()
+        levels_m = get_array(state, "first_camera_m", (None,), np.float64)
+        if (counts < 0).any() or len(levels_m) > 1 or not np.isfinite(levels_m).all():
+            raise MapFileError("state floor: expected counts of zero or more and at most one finite level, got others")
+        return cls(float(levels_m[0]) if len(levels_m) else None, counts)
 
     @property
     def level_m(self) -> float:
@@ -213,9 +231,6 @@ def _is_of_any_height(head: str) -> bool:
 
 def _is_within(value: float, limits: Sequence[float]) -> bool:
     return limits[0] <= value <= limits[1]
-
-
-_OTHER_NAMES = (MatchBasis.SYNONYM, MatchBasis.KIND, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR)
 
 
 def _is_found(match: NounMatch) -> bool:

@@ -17,8 +17,8 @@ from gausslite.domain.relevance import BallRegion
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TaskGraph
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.object_map import Landmark, Observation
-from gausslite.perception.relations import select_extreme
 from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite_selection.superlatives import select_extreme
 
 EYE_M = np.array((0.0, -1.0, -3.0))
 MIRRORED = {

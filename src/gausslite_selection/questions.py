@@ -14,10 +14,11 @@ from numpy import ndarray
 
 from gausslite.domain.objects import Answer, ObjectLandmark
 from gausslite.domain.pose import UpAxis, unit_up_axis
-from gausslite.domain.task import Relation, Superlative, TaskGraph, noun_of
+from gausslite.domain.task import Superlative, TaskGraph, noun_of
 from gausslite.nouns import meant_by
 from gausslite.perception.object_map import Landmark, Observation
-from gausslite.perception.relations import RelationFilter, select_extreme
+from gausslite.perception.relations import RelationFilter
+from gausslite_selection.selector import AttributeSelector
 
 _BOX_STEP_M = 0.05
 _MAX_STEPS = 16
@@ -35,8 +36,8 @@ def answer(
     Unlike a task, a relation to an anchor that the map does not have selects nothing. T_world_camera: the viewpoint of
     left_of, nearest and the like; without it, sides are evaluated as near.
     """
-    mapped, up = _MappedObjects(objects), np.array(unit_up_axis(up_axis))
-    relations = RelationFilter(graph, up, mapped, _NoSurfaces())
+    mapped, selector = _MappedObjects(objects), AttributeSelector(graph, (), np.array(unit_up_axis(up_axis)))
+    relations = RelationFilter(graph, mapped, selector)
     notes = [f"the map has no {noun_of(name)!r}" for name in relations.unseen_anchors]
     if notes:
         return Answer((), tuple(notes))
@@ -61,7 +62,7 @@ def answer(
                 notes.append(f"{superlative}: needs a viewpoint, which this map does not have")
                 continue
             pose = np.eye(4) if T_world_camera is None else T_world_camera
-            fitting = [select_extreme(fitting, superlative, up, pose)]
+            fitting = selector.select(target, fitting, pose)
         chosen += fitting
     numbers = sorted({landmark.number for landmark in chosen})
     return Answer(tuple(objects[number] for number in numbers), tuple(notes))
@@ -93,20 +94,6 @@ class _MappedObjects:
     def candidates(self, name: str) -> list[Landmark]:
         """Return the same."""
         return self.seen(name)
-
-
-class _NoSurfaces:
-    """No height is known of what an object stands on: boxes decide."""
-
-    def is_by_height(self, relation: Relation) -> bool:
-        """Return False."""
-        del relation
-        return False
-
-    def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
-        """Return None."""
-        del relation, seen
-        return None
 
 
 def _landmark(number: int, found: ObjectLandmark) -> Landmark:
