@@ -144,7 +144,7 @@ def configure_refine(parser: CommandParser) -> None:
         metavar="N",
         type=bounded(int, 1, _MAX_ITERATIONS),
         default=0,
-        help="training iterations (default: the server's)",
+        help="most training iterations (default: the server's)",
     )
     add(
         "--seed",
@@ -164,13 +164,15 @@ def run_refine(options: argparse.Namespace) -> int:
     """
     if options.out is not None:
         prepare_file(options.out, MAP_FILE)
-    gaussians = 0
+    gaussians, left_out = 0, list[str]()
     with fusion_client(options) as client:
         with progress_bar(options.iterations, "refine", "it") as bar:
             for progress in client.refine(options.iterations, seed=options.seed):
-                bar.total, gaussians = progress.iterations, progress.gaussians
+                bar.total, gaussians, left_out = progress.iterations, progress.gaussians, list(progress.left_out)
                 bar.set_postfix_str(f"loss {progress.loss:.4f}", refresh=False)
                 bar.update(progress.iteration - bar.n)
+        for line in left_out:
+            print(f"left out, because they disagree with the vote: {line}")
         print(f"refined {gaussians:,} Gaussians")
         if options.out is not None:
             write_atomic(options.out, client.export(Export("refined")))

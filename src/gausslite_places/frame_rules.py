@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_points
-from gausslite.fusion.earlier_map import is_earlier_map
+from gausslite.fusion.epochs import is_former
 from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameFit, Segment
 
 _MIN_SHIFT_M, _MIN_ROTATION_DEG = 0.03, 1.5
@@ -81,7 +81,7 @@ class Majority:
         self._comparisons = {pair: found for pair, found in comparisons.items() if pair <= self._orders.keys()}
         # a robot does not agree with itself: earlier maps do not count
         self.supporters = {
-            name: {other for other in names if not is_earlier_map(other) and self._agree(name, other)} for name in names
+            name: {other for other in names if not is_former(other) and self._agree(name, other)} for name in names
         }
 
     def leads(self, one: str, other: str) -> bool:

@@ -1,4 +1,4 @@
-"""Texture atlas with mip levels: a whole view is textured with two look-ups."""
+"""Texture atlas with mip levels, and means over the footprints of pixels."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from gausslite_sim.textures import SIDE_PX, Texture
 
 _LEVELS = 7
 _MARGIN_PX = 2
-_ROW_PX = 512
 _SHARPNESS = 0.4
-"""Mip level bias towards finer levels: a camera's lens blurs less than one pixel."""
+"""Mip level bias towards finer levels: interpolation blurs more than the mean over a square does."""
+_MAX_TAPS_LOG2 = 5
+_CHUNK = 2048
+"""Footprints of one look-up: its coordinates stay in the processor's cache."""
 
 
 class TextureAtlas:
@@ -35,35 +37,52 @@ class TextureAtlas:
         for i, texture in enumerate(textures):
             self._place(i, texture.rgb)
 
-    def sample(
+    def mean(
         self,
         texture: Int64[ndarray, " n"],
         uv: Float32[ndarray, "n 2"],
-        texels_per_pixel: Float32[ndarray, " n"],
+        sides: Float32[ndarray, "2 n 2"],
+        taps: int,
     ) -> Float32[ndarray, "n 3"]:
-        """Return colours 0 to 255 at texture coordinates (1 = one repeat), filtered to the pixel's footprint."""
-        level = np.clip(np.log2(np.maximum(texels_per_pixel, 1e-6)) - _SHARPNESS, 0, _LEVELS - 1.001)
-        fine = level.astype(np.int64)
-        share = (level - fine).astype(np.float32)[:, None]
-        wrapped = uv - np.floor(uv)
-        low, high = self._look_up(texture, wrapped, fine), self._look_up(texture, wrapped, fine + 1)
-        blended: Float32[ndarray, "n 3"] = low + share * (high - low)
-        return blended
+        """Return mean colours 0 to 255 over parallelograms round these texture coordinates, with these sides.
 
-    def _look_up(
-        self, texture: Int64[ndarray, " n"], wrapped: Float32[ndarray, "n 2"], level: Int64[ndarray, " n"]
-    ) -> Float32[ndarray, "n 3"]:
-        n = len(texture)
+        taps: least number of look-ups along the shorter side, if that is longer than so many texels.
+        """
+        across, down = sides
+        widths, heights = SIDE_PX * np.hypot(sides[..., 0], sides[..., 1])
+        cells = np.maximum(np.minimum(widths, heights) / taps, 1.0)
+        counts_log2 = [
+            np.clip(np.ceil(np.log2(np.maximum(lengths / cells, 0.5)) - 0.25), 0, _MAX_TAPS_LOG2).astype(np.int64)
+            for lengths in (widths, heights)
+        ]
+        areas = np.maximum(widths * heights / 2.0 ** (counts_log2[0] + counts_log2[1]), 1e-6)
+        level = np.clip(np.rint(0.5 * np.log2(areas) - _SHARPNESS), 0, _LEVELS - 1).astype(np.int64)
+        origins, scale = self._origins(texture, level), self._sides[level]
+        means = np.empty((len(texture), 3), np.float32)
+        shapes = counts_log2[0] * (_MAX_TAPS_LOG2 + 1) + counts_log2[1]
+        for shape in np.unique(shapes):
+            selected = np.flatnonzero(shapes == shape)
+            places = _tap_grid(*divmod(int(shape), _MAX_TAPS_LOG2 + 1))
+            for part in np.array_split(selected, -(-len(selected) // _CHUNK)):
+                positions = []
+                for axis in (0, 1):
+                    at = uv[part, axis] + places[0] * across[part, axis] + places[1] * down[part, axis]
+                    at -= np.floor(at)
+                    at *= scale[part]
+                    at += origins[axis][part]
+                    positions.append(at)
+                colours = cv2.remap(self._image, positions[0], positions[1], cv2.INTER_LINEAR)
+                means[part] = colours.sum(axis=0, dtype=np.uint32) / np.float32(len(colours))
+        return means
+
+    def _origins(
+        self, texture: Int64[ndarray, " n"], level: Int64[ndarray, " n"]
+    ) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
+        """Return the column and row in the atlas of each texture's corner at its mip level."""
         row, column = np.divmod(texture, self._columns)
-        pitch, side = self._pitches[level], self._sides[level]
-        offset = np.float32(_MARGIN_PX - 0.5)
-        # cv2.remap limits the image width, so the points are arranged in rows
-        grid = np.zeros((2, -(-n // _ROW_PX) * _ROW_PX), np.float32)
-        grid[0, :n] = self._lefts[level] + column.astype(np.float32) * pitch + wrapped[:, 0] * side + offset
-        grid[1, :n] = self._tops[level] + row.astype(np.float32) * pitch + wrapped[:, 1] * side + offset
-        x, y = grid.reshape(2, -1, _ROW_PX)
-        colours = cv2.remap(self._image, x, y, cv2.INTER_LINEAR)
-        return colours.reshape(-1, 3)[:n].astype(np.float32)
+        pitch, offset = self._pitches[level], np.float32(_MARGIN_PX - 0.5)
+        x = self._lefts[level] + column.astype(np.float32) * pitch + offset
+        return x, self._tops[level] + row.astype(np.float32) * pitch + offset
 
     def _place(self, i: int, rgb: UInt8[ndarray, "s s 3"]) -> None:
         row, column = divmod(i, self._columns)
@@ -74,3 +93,10 @@ class TextureAtlas:
             pitch = int(self._pitches[level])
             top, left = int(self._tops[level]) + row * pitch, int(self._lefts[level]) + column * pitch
             self._image[top : top + pitch, left : left + pitch] = np.pad(small, margin, mode="wrap")
+
+
+def _tap_grid(across_log2: int, down_log2: int) -> Float32[ndarray, "2 k 1"]:
+    """Return the places of a footprint's look-ups, in shares of its sides from its centre."""
+    across, down = ((np.arange(1 << count) + 0.5) / (1 << count) - 0.5 for count in (across_log2, down_log2))
+    grid = np.stack(np.meshgrid(across, down), axis=0).reshape(2, -1, 1)
+    return grid.astype(np.float32)

@@ -14,21 +14,17 @@ def laptop(screen: str) -> list[Part]:
     base = box((-0.165, -0.12, 0), (0.165, 0.12, 0.016))
     keys = panel((-0.15, 0.09, 0.0165), (0.3, 0, 0), (0, -0.12, 0), fit=True)
     pad = panel((-0.05, -0.045, 0.0165), (0.1, 0, 0), (0, -0.065, 0), fit=True)
-    lid = box((-0.165, 0, 0), (0.165, 0.008, 0.225)).rotate_x(-0.32).translate((0, 0.12, 0.014))
-    shown = (
-        panel((-0.155, -0.0008, 0.215), (0.31, 0, 0), (0, 0, -0.2), fit=True)
-        .rotate_x(-0.32)
-        .translate((0, 0.12, 0.014))
-    )
+    lid = box((-0.165, 0, 0), (0.165, 0.008, 0.225))
+    shown = panel((-0.155, -0.0008, 0.215), (0.31, 0, 0), (0, 0, -0.2), fit=True)
+    lid, shown = (mesh.rotate_x(-0.32).translate((0, 0.12, 0.014)) for mesh in (lid, shown))
     return [Part(merge_meshes([base, lid, pad]), "aluminium"), Part(keys, "keys"), Part(shown, screen)]
 
 
 def keyboard() -> list[Part]:
     """A full-size keyboard with a cable, tilted towards its user."""
-    body = box((-0.22, -0.07, 0), (0.22, 0.07, 0.018)).rotate_x(0.07).translate((0, 0, 0.006))
-    keys = (
-        panel((-0.212, 0.063, 0.0185), (0.424, 0, 0), (0, -0.126, 0), fit=True).rotate_x(0.07).translate((0, 0, 0.006))
-    )
+    body = box((-0.22, -0.07, 0), (0.22, 0.07, 0.018))
+    keys = panel((-0.212, 0.063, 0.0185), (0.424, 0, 0), (0, -0.126, 0), fit=True)
+    body, keys = (mesh.rotate_x(0.07).translate((0, 0, 0.006)) for mesh in (body, keys))
     cable = tube([(0, 0.07, 0.012), (0.02, 0.14, 0.004), (-0.05, 0.24, 0.004), (0.03, 0.34, 0.004)], 0.003)
     return [Part(merge_meshes([body, cable]), "black_plastic"), Part(keys, "keys")]
 
@@ -82,13 +78,8 @@ def desk_lamp(colour: str) -> list[Part]:
 
 def floor_lamp(shade: str) -> list[Part]:
     """A floor lamp: a tripod of thin rods under a cloth drum."""
-    feet: list[tuple[Vector, Vector]] = [
-        (
-            (0.28 * float(np.cos(a)), 0.28 * float(np.sin(a)), 0.0),
-            (0.02 * float(np.cos(a)), 0.02 * float(np.sin(a)), 1.25),
-        )
-        for a in (0.5, 2.6, 4.7)
-    ]
+    directions = [(float(np.cos(a)), float(np.sin(a))) for a in (0.5, 2.6, 4.7)]
+    feet: list[tuple[Vector, Vector]] = [((0.28 * x, 0.28 * y, 0.0), (0.02 * x, 0.02 * y, 1.25)) for x, y in directions]
     drum = lathe([(0.21, 1.2), (0.21, 1.5)], sectors=36)
     inside = lathe([(0.208, 1.5), (0.208, 1.2)], sectors=36)
     return [Part(rods(feet, 0.012), "light_wood"), Part(drum, shade), Part(inside, "glow")]

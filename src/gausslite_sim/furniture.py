@@ -25,10 +25,7 @@ def chair() -> list[Part]:
     frame += [box((-0.17, 0.178, z), (0.17, 0.202, z + 0.07)) for z in (0.58, 0.70)]
     frame += [box((-0.17, y - 0.01, 0.2), (0.17, y + 0.01, 0.23)) for y in (-0.18, 0.19)]
     top = box((-0.21, 0.172, 0.82), (0.21, 0.208, 0.94))
-    return [
-        Part(merge_meshes([*frame, top]), "cherry"),
-        Part(box((-0.22, -0.22, 0.43), (0.22, 0.17, 0.475)), "plaid"),
-    ]
+    return [Part(merge_meshes([*frame, top]), "cherry"), Part(box((-0.22, -0.22, 0.43), (0.22, 0.17, 0.475)), "plaid")]
 
 
 def mug() -> list[Part]:

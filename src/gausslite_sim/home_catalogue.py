@@ -9,16 +9,7 @@ import numpy as np
 
 from gausslite_sim import two_room_layout, two_room_trajectories
 from gausslite_sim.home_plan import HomePlan
-from gausslite_sim.homes import (
-    bedroom,
-    kitchen_diner,
-    living_room,
-    lounge,
-    meeting_room,
-    open_office,
-    study,
-    workshop,
-)
+from gausslite_sim.homes import bedroom, kitchen_diner, living_room, lounge, meeting_room, open_office, study, workshop
 from gausslite_sim.lighting import Lighting
 from gausslite_sim.materials import Painter, paint
 from gausslite_sim.scene_objects import Item
@@ -44,16 +35,7 @@ class Home:
 
 HOMES = tuple(
     Home(module.furnish, module.painters, module.LIGHTING, module.TRAJECTORIES)
-    for module in (
-        living_room,
-        bedroom,
-        kitchen_diner,
-        study,
-        open_office,
-        meeting_room,
-        lounge,
-        workshop,
-    )
+    for module in (living_room, bedroom, kitchen_diner, study, open_office, meeting_room, lounge, workshop)
 )
 HOME_COUNT = len(HOMES)
 

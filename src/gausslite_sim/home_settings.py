@@ -16,7 +16,13 @@ _NUMBER = r"-?[0-9]{1,2}(?:\.[0-9]{1,3})?"
 _CHANGES = re.compile(rf"(\w+):(?:gone|({_NUMBER}):({_NUMBER})(?::({_NUMBER}))?)")
 _NUMBERS = ("seed", "trajectory", "frames", "laps", "movers")
 _STRENGTHS = ("noise", "exposure")
-_TIMES = {"shutter": "readout_ms", "blur": "exposure_ms"}
+_UNITS = {
+    "shutter": (r"[0-9]{1,3}(\.[0-9]{1,3})?ms", "readout_ms"),
+    "blur": (r"[0-9]{1,3}(\.[0-9]{1,3})?ms", "exposure_ms"),
+    "speed": (r"[0-9]{1,4}", "speed_deg_s"),
+    "drift": (r"[0-9]{1,2}(\.[0-9]{1,3})?%", "drift_percent"),
+}
+"""Pattern and setting of numbers with a unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +85,12 @@ class HomeSettings:
                 settings[key] = int(value)
             elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
                 settings[key] = float(value)
-            elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
-                settings["size_px"] = (int(match.group(1)), int(match.group(2)))
-            elif key in _TIMES and (match := re.fullmatch(r"([0-9]{1,3}(?:\.[0-9]{1,3})?)ms", value)):
-                settings[_TIMES[key]] = float(match.group(1))
+            elif key == "size" and re.fullmatch(r"[0-9]{1,5}x[0-9]{1,5}", value):
+                settings["size_px"] = tuple(int(side) for side in value.split("x"))
+            elif key in _UNITS and re.fullmatch(_UNITS[key][0], value):
+                settings[_UNITS[key][1]] = float(value.rstrip("ms%"))
             elif key == "lens":
                 settings["lens"] = _read_lens(value, home)
-            elif key == "speed" and re.fullmatch(r"[0-9]{1,4}", value):
-                settings["speed_deg_s"] = float(value)
-            elif key == "drift" and (match := re.fullmatch(r"([0-9]{1,2}(?:\.[0-9]{1,3})?)%", value)):
-                settings["drift_percent"] = float(match.group(1))
             elif key == "changes" and all(_CHANGES.fullmatch(change) for change in value.split(",")):
                 settings["changes"] = tuple(_read_change(change) for change in value.split(","))
             else:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gausslite_sim.printed_textures import Picture
+from gausslite_sim.printed_textures import FONT, Ink, Picture, ink_of, write
 from gausslite_sim.textures import SIDE_PX, Colour, Texture, grain, noise, tint
 
-Ink = tuple[int, int, int]
-FONT = cv2.FONT_HERSHEY_DUPLEX
 SMALL_FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TITLES = ("DUNES", "FERRY", "ORBIT", "SALT", "WINTER", "GLASS", "MAPS", "TEA", "RIVERS", "LIGHT", "ROOTS", "SIGNAL")
 _SYLLABLES = ("ra", "ne", "to", "li", "sa", "mu", "ke", "do", "vi", "pon", "tar", "el", "um", "is", "gra", "fel")
@@ -23,9 +21,7 @@ def spine(rng: np.random.Generator, colour: Colour) -> Texture:
     for y in (30, 60, 450, 478):
         cv2.rectangle(picture, (0, y), (SIDE_PX, y + 12), light, -1)
     title = np.zeros((SIDE_PX, 360, 3), np.uint8)
-    cv2.putText(
-        title, str(rng.choice(_TITLES)), (6, 330), FONT, 3.2, (255, 255, 255), thickness=12, lineType=cv2.LINE_AA
-    )
+    write(title, str(rng.choice(_TITLES)), (6, 330), 3.2, (255, 255, 255), (FONT, 12))
     turned = np.rot90(title, -1)
     picture[84 : 84 + len(turned)][turned > 110] = light[0]
     return Texture(picture)
@@ -34,7 +30,7 @@ def spine(rng: np.random.Generator, colour: Colour) -> Texture:
 def page(rng: np.random.Generator) -> Texture:
     """A printed sheet: a heading, a table, paragraphs."""
     picture = tint(0.92 + 0.1 * grain(rng), (0.96, 0.95, 0.92))
-    cv2.putText(picture, "REPORT 27", (40, 66), FONT, 1.8, DARK_INK, thickness=4, lineType=cv2.LINE_AA)
+    write(picture, "REPORT 27", (40, 66), 1.8, DARK_INK, (FONT, 4))
     paragraph(picture, rng, (40, 96, 472, 250), 17)
     for y in range(270, 371, 25):
         cv2.line(picture, (40, y), (472, y), (90, 90, 100), 2)
@@ -47,7 +43,7 @@ def page(rng: np.random.Generator) -> Texture:
 def magazine(rng: np.random.Generator, colour: Colour) -> Texture:
     """A cover with a title, an image and lines of text."""
     picture = tint(0.85 + 0.25 * grain(rng), colour)
-    cv2.putText(picture, "HABITAT", (24, 110), FONT, 3.3, (248, 246, 238), thickness=10, lineType=cv2.LINE_AA)
+    write(picture, "HABITAT", (24, 110), 3.3, (248, 246, 238), (FONT, 10))
     shade = noise(rng, 8, 8)[150:400, 60:452]
     picture[150:400, 60:452] = np.stack([60 + 180 * shade, 90 + 110 * shade, 150 - 80 * shade], -1).astype(np.uint8)
     cv2.circle(picture, (180, 260), 60, (244, 214, 120), -1, cv2.LINE_AA)
@@ -60,7 +56,7 @@ def poster(rng: np.random.Generator, colour: Colour) -> Texture:
     picture = tint(0.9 + 0.15 * grain(rng), (0.93, 0.90, 0.82))
     for radius in range(30, 170, 26):
         cv2.circle(picture, (256, 200), radius, ink_of(255 * np.asarray(colour)), 12, cv2.LINE_AA)
-    cv2.putText(picture, "JAZZ", (70, 250), FONT, 6.0, (190, 50, 36), thickness=22, lineType=cv2.LINE_AA)
+    write(picture, "JAZZ", (70, 250), 6.0, (190, 50, 36), (FONT, 22))
     paragraph(picture, rng, (60, 400, 452, 480), 20)
     cv2.rectangle(picture, (0, 0), (SIDE_PX - 1, SIDE_PX - 1), DARK_INK, 18)
     return Texture(picture)
@@ -106,9 +102,7 @@ def city_map(rng: np.random.Generator) -> Texture:
         cv2.line(picture, *ends, (250, 214, 130), 7, cv2.LINE_AA)
     for _ in range(22):
         at = (int(rng.integers(0, 430)), int(rng.integers(16, 500)))
-        cv2.putText(
-            picture, any_word(rng).upper(), at, SMALL_FONT, 0.5, (60, 60, 70), thickness=1, lineType=cv2.LINE_AA
-        )
+        write(picture, any_word(rng).upper(), at, 0.5, (60, 60, 70), (SMALL_FONT, 1))
     cv2.rectangle(picture, (0, 0), (SIDE_PX - 1, SIDE_PX - 1), DARK_INK, 12)
     return Texture(picture)
 
@@ -122,7 +116,7 @@ def dotted_mug(rng: np.random.Generator, colour: Colour) -> Texture:
             cv2.circle(picture, at, 12, (246, 238, 214), -1, cv2.LINE_AA)
     cv2.rectangle(picture, (0, 205), (SIDE_PX, 315), (240, 236, 224), -1)
     for x in (14, 270):
-        cv2.putText(picture, "HELLO", (x, 288), FONT, 2.3, DARK_INK, thickness=7, lineType=cv2.LINE_AA)
+        write(picture, "HELLO", (x, 288), 2.3, DARK_INK, (FONT, 7))
     return Texture(picture, gloss=0.2)
 
 
@@ -144,7 +138,7 @@ def bottle_label(rng: np.random.Generator, colour: Colour) -> Texture:
     for x in (128, 384):
         cv2.circle(picture, (x, 110), 62, ink, 10, cv2.LINE_AA)
         cv2.line(picture, (x - 40, 150), (x + 40, 70), ink, 10, cv2.LINE_AA)
-        cv2.putText(picture, "CHATEAU", (x - 112, 260), FONT, 1.5, DARK_INK, thickness=5, lineType=cv2.LINE_AA)
+        write(picture, "CHATEAU", (x - 112, 260), 1.5, DARK_INK, (FONT, 5))
         paragraph(picture, rng, (x - 104, 290, x + 104, 440), 22)
     for y in (0, 484):
         cv2.rectangle(picture, (0, y), (SIDE_PX, y + 26), ink, -1)
@@ -157,7 +151,7 @@ def jar_label(rng: np.random.Generator, colour: Colour) -> Texture:
     for x in (30, 286):
         cv2.rectangle(picture, (x, 130), (x + 196, 390), (244, 240, 230), -1)
         cv2.rectangle(picture, (x + 10, 140), (x + 186, 380), ink_of(255 * np.asarray(colour)), 6)
-        cv2.putText(picture, "PLUM", (x + 22, 240), FONT, 1.9, DARK_INK, thickness=6, lineType=cv2.LINE_AA)
+        write(picture, "PLUM", (x + 22, 240), 1.9, DARK_INK, (FONT, 6))
         paragraph(picture, rng, (x + 26, 270, x + 172, 360), 26)
     return Texture(picture, gloss=0.25)
 
@@ -166,7 +160,7 @@ def packet(rng: np.random.Generator, colour: Colour) -> Texture:
     """A printed box or tin: a large title on a band, stripes, a bar code."""
     picture = tint(0.88 + 0.2 * grain(rng), colour)
     cv2.rectangle(picture, (0, 90), (SIDE_PX, 250), (244, 240, 226), -1)
-    cv2.putText(picture, str(rng.choice(_TITLES)), (24, 208), FONT, 3.2, DARK_INK, thickness=11, lineType=cv2.LINE_AA)
+    write(picture, str(rng.choice(_TITLES)), (24, 208), 3.2, DARK_INK, (FONT, 11))
     for y in range(280, 360, 20):
         cv2.line(picture, (0, y), (SIDE_PX, y + 30), (250, 210, 90), 8, cv2.LINE_AA)
     cv2.rectangle(picture, (300, 384), (490, 494), (246, 246, 246), -1)
@@ -194,25 +188,10 @@ def paragraph(
         x = left
         while x < right - 30 and rng.random() < 0.94:
             word = any_word(rng)
-            cv2.putText(
-                picture,
-                word,
-                (x, y - 4),
-                SMALL_FONT,
-                line_px / 34,
-                ink,
-                thickness=max(1, line_px // 13),
-                lineType=cv2.LINE_AA,
-            )
+            write(picture, word, (x, y - 4), line_px / 34, ink, (SMALL_FONT, max(1, line_px // 13)))
             x += round(0.58 * line_px * len(word)) + 6
 
 
 def any_word(rng: np.random.Generator) -> str:
     """Return one to three random syllables."""
     return "".join(rng.choice(_SYLLABLES, int(rng.integers(1, 4))))
-
-
-def ink_of(values: np.ndarray) -> Ink:
-    """Return red, green and blue as OpenCV expects them."""
-    red, green, blue = (int(value) for value in values)
-    return (red, green, blue)

@@ -32,20 +32,21 @@ class Mesh:
 
     def rotate_z(self, yaw_rad: float) -> Mesh:
         """Return the mesh rotated about z."""
-        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
+        return self._rotate(yaw_rad, 0, 1)
 
     def rotate_x(self, pitch_rad: float) -> Mesh:
         """Return the mesh rotated about x: a positive angle lowers the front (-y)."""
-        c, s = np.cos(pitch_rad), np.sin(pitch_rad)
-        R = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-        return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
+        return self._rotate(pitch_rad, 1, 2)
 
     def rotate_y(self, roll_rad: float) -> Mesh:
         """Return the mesh rotated about y: a positive angle lowers the right side (+x)."""
-        c, s = np.cos(roll_rad), np.sin(roll_rad)
-        R = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return self._rotate(roll_rad, 2, 0)
+
+    def _rotate(self, angle_rad: float, first: int, second: int) -> Mesh:
+        """Return the mesh rotated from the first axis towards the second one."""
+        R, c, s = np.eye(3), np.cos(angle_rad), np.sin(angle_rad)
+        R[first, first] = R[second, second] = c
+        R[first, second], R[second, first] = -s, s
         return Mesh(self.positions_m @ R.T, self.uv, self.normals @ R.T, self.faces)
 
 
@@ -170,13 +171,12 @@ def _strip(
 ) -> Mesh:
     """Return the band between two rings, the upper one first."""
     share = np.linspace(0.0, 1.0, sectors + 1)
-    cosine, sine = np.cos(2 * np.pi * share), np.sin(2 * np.pi * share)
-    rings, ring_normals, uv = [], [], []
-    for (radius, z), (normal_r, normal_z), down in zip(points, normals, v, strict=True):
-        rings.append(np.stack([radius * cosine, radius * sine, np.full_like(share, z)], axis=1))
-        ring_normals.append(np.stack([normal_r * cosine, normal_r * sine, np.full_like(share, normal_z)], axis=1))
-        uv.append(np.stack([share, np.full_like(share, down)], axis=1) * scale)
-    return Mesh(np.concatenate(rings), np.concatenate(uv), np.concatenate(ring_normals), _grid_faces(1, sectors))
+    circle = np.stack([np.cos(2 * np.pi * share), np.sin(2 * np.pi * share), np.ones_like(share)], axis=1)
+    rings, ring_normals = (
+        np.concatenate([circle * (radial, radial, up) for radial, up in pairs]) for pairs in (points, normals)
+    )
+    uv = np.concatenate([np.stack([share, np.full_like(share, down)], axis=1) for down in v]) * scale
+    return Mesh(rings, uv, ring_normals, _grid_faces(1, sectors))
 
 
 def _grid(

@@ -10,8 +10,8 @@ from numpy import ndarray
 from gausslite_sim.textures import SIDE_PX, Colour, Texture, grain, noise, tint, wood
 
 Picture = UInt8[ndarray, "s s 3"]
-_Ink = tuple[int, int, int]
-_FONT = cv2.FONT_HERSHEY_DUPLEX
+Ink = tuple[int, int, int]
+FONT = cv2.FONT_HERSHEY_DUPLEX
 _WORDS = ("ATLAS", "SOUP", "RIVER", "GARDEN", "NORTH", "CLAY", "STARS", "BREAD", "HARBOUR", "MOSS", "TIDE", "ORCHARD")
 
 
@@ -24,7 +24,7 @@ def mug_print(rng: np.random.Generator) -> Texture:
         cv2.circle(picture, (16 + 32 * i, 95), 11, (250, 236, 120), -1, cv2.LINE_AA)
         cv2.circle(picture, (32 * i, 426), 8, (240, 240, 240), -1, cv2.LINE_AA)
     for x in (30, 286):
-        _write(picture, "CAFE", (x, 300), 2.6, (30, 60, 40), 9)
+        write(picture, "CAFE", (x, 300), 2.6, (30, 60, 40), (FONT, 9))
     return Texture(picture)
 
 
@@ -48,7 +48,7 @@ def book_cover(rng: np.random.Generator, colour: Colour) -> Texture:
     picture = tint(0.78 + 0.4 * grain(rng), colour)
     gold = (232, 200, 110)
     cv2.rectangle(picture, (36, 36), (SIDE_PX - 36, SIDE_PX - 36), gold, 6)
-    _write(picture, str(rng.choice(_WORDS)), (70, 150), 2.2, gold, 6)
+    write(picture, str(rng.choice(_WORDS)), (70, 150), 2.2, gold, (FONT, 6))
     cv2.circle(picture, (256, 320), 84, gold, 8, cv2.LINE_AA)
     for i in range(8):
         angle = i * np.pi / 4
@@ -64,13 +64,13 @@ def book_row(rng: np.random.Generator) -> Texture:
     while x < SIDE_PX - 14:
         width, top = int(rng.integers(22, 46)), int(rng.integers(8, 130))
         right = min(x + width, SIDE_PX - 2)
-        back: _Ink = _ink(rng.integers(30, 215, 3))
+        back: Ink = ink_of(rng.integers(30, 215, 3))
         cv2.rectangle(picture, (x, top), (right, SIDE_PX), back, -1)
-        light = _ink(np.minimum(np.array(back) + 90, 255))
+        light = ink_of(np.minimum(np.array(back) + 90, 255))
         for y in (top + 26, SIDE_PX - 46):
             cv2.rectangle(picture, (x, y), (right, y + 10), light, -1)
         label = np.zeros((right - x, 300, 3), np.uint8)
-        _write(label, str(rng.choice(_WORDS)), (6, (right - x) // 2 + 8), 0.8, (255, 255, 255), 2)
+        write(label, str(rng.choice(_WORDS)), (6, (right - x) // 2 + 8), 0.8, (255, 255, 255), (FONT, 2))
         turned = np.rot90(label)
         spot = picture[top + 50 : top + 350, x:right]
         spot[turned[: len(spot)] > 100] = 238
@@ -98,7 +98,7 @@ def painting(rng: np.random.Generator) -> Texture:
     picture = tint(0.8 + 0.35 * grain(rng), (0.92, 0.87, 0.74))
     for _ in range(26):
         x, y = (int(value) for value in rng.integers(40, SIDE_PX - 40, 2))
-        ink, size = _ink(rng.integers(20, 240, 3)), int(rng.integers(14, 74))
+        ink, size = ink_of(rng.integers(20, 240, 3)), int(rng.integers(14, 74))
         if rng.random() < 0.5:
             cv2.circle(picture, (x, y), size, ink, -1 if rng.random() < 0.6 else 9, cv2.LINE_AA)
         else:
@@ -113,7 +113,7 @@ def painting(rng: np.random.Generator) -> Texture:
 def newspaper(rng: np.random.Generator) -> Texture:
     """A headline, a photograph and columns of small print."""
     picture = tint(0.86 + 0.2 * grain(rng), (0.9, 0.89, 0.84))
-    _write(picture, "THE MORNING", (24, 70), 2.2, (20, 20, 20), 6)
+    write(picture, "THE MORNING", (24, 70), 2.2, (20, 20, 20), (FONT, 6))
     cv2.line(picture, (20, 90), (492, 90), (20, 20, 20), 4)
     photo = (60 + 150 * noise(rng, 32, 32)[:170, :220]).astype(np.uint8)
     picture[120:290, 24:244] = photo[..., None]
@@ -127,7 +127,7 @@ def carton(rng: np.random.Generator, colour: Colour, word: str) -> Texture:
     """A cardboard side with tape, a label, arrows and a bar code."""
     picture = tint(0.72 + 0.5 * grain(rng), colour)
     cv2.rectangle(picture, (0, 226), (SIDE_PX, 274), (206, 184, 140), -1)
-    _write(picture, word, (36, 130), 2.6, (150, 26, 24), 9)
+    write(picture, word, (36, 130), 2.6, (150, 26, 24), (FONT, 9))
     cv2.rectangle(picture, (40, 316), (280, 470), (240, 240, 236), -1)
     for x in range(56, 266, 6):
         cv2.line(picture, (x, 336), (x, 420), (16, 16, 16), int(rng.integers(1, 5)))
@@ -162,11 +162,11 @@ def fridge_front(rng: np.random.Generator) -> Texture:
         cv2.rectangle(picture, (446, top), (470, bottom), (70, 74, 80), -1)
     for _ in range(9):
         x, y = int(rng.integers(30, 330)), int(rng.integers(190, 420))
-        paper = _ink(rng.integers(150, 255, 3))
+        paper = ink_of(rng.integers(150, 255, 3))
         cv2.rectangle(picture, (x, y), (x + 74, y + 52), paper, -1)
         for line in range(y + 14, y + 46, 9):
             cv2.line(picture, (x + 8, line), (x + int(rng.integers(30, 66)), line), (60, 60, 80), 3)
-        cv2.circle(picture, (x + 37, y + 4), 8, _ink(rng.integers(0, 200, 3)), -1, cv2.LINE_AA)
+        cv2.circle(picture, (x + 37, y + 4), 8, ink_of(rng.integers(0, 200, 3)), -1, cv2.LINE_AA)
     return Texture(picture)
 
 
@@ -193,7 +193,7 @@ def calendar(rng: np.random.Generator) -> Texture:
     for day in range(31):
         row, column = divmod(day + 2, 7)
         ink = (190, 30, 30) if column == 6 else (30, 30, 36)
-        _write(picture, str(day + 1), (30 + 68 * column, 282 + 50 * row), 1.1, ink, 3)
+        write(picture, str(day + 1), (30 + 68 * column, 282 + 50 * row), 1.1, ink, (FONT, 3))
     return Texture(picture)
 
 
@@ -222,10 +222,14 @@ def leaf_veins(rng: np.random.Generator) -> Texture:
     return Texture(picture)
 
 
-def _write(picture: Picture | ndarray, text: str, at: tuple[int, int], scale: float, ink: _Ink, weight: int) -> None:
-    cv2.putText(picture, text, at, _FONT, scale, ink, thickness=weight, lineType=cv2.LINE_AA)
+def write(
+    picture: Picture | ndarray, text: str, at: tuple[int, int], scale: float, ink: Ink, pen: tuple[int, int]
+) -> None:
+    """Write text from its lower left corner. pen: font and width of the lines."""
+    cv2.putText(picture, text, at, pen[0], scale, ink, thickness=pen[1], lineType=cv2.LINE_AA)
 
 
-def _ink(values: ndarray) -> _Ink:
+def ink_of(values: ndarray) -> Ink:
+    """Return red, green and blue as OpenCV expects them."""
     red, green, blue = (int(value) for value in values)
     return (red, green, blue)

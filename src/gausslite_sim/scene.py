@@ -17,15 +17,14 @@ from gausslite_sim.atlas import TextureAtlas
 from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.lighting import vertex_light
 from gausslite_sim.mesh import merge_meshes
-from gausslite_sim.textures import SIDE_PX
 
 NO_HIT = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Triangles:
-    """Per triangle: texture coordinates, light and normals of its corners, its own unit normal, texture, item, gloss
-    and texels per metre.
+    """Per triangle: texture coordinates, light and normals of its corners, its own unit normal, texture, item, gloss,
+    texture coordinates per metre along each axis of the world, and the mean of all directions in its plane.
     """
 
     uv: Float32[ndarray, "m 3 2"]
@@ -35,7 +34,8 @@ class Triangles:
     texture: Int64[ndarray, " m"]
     item: Int64[ndarray, " m"]
     gloss: Float32[ndarray, " m"]
-    texels_per_m: Float32[ndarray, " m"]
+    uv_per_m: Float32[ndarray, "m 2 3"]
+    mean_uv_per_m: Float32[ndarray, " m"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class HomeScene:
     """Ray caster and triangle tables of one home. Raises DatasetError without the extra `sim`."""
 
     def __init__(self, plan: HomePlan) -> None:
-        new_caster = _ray_caster()
+        new_caster = ray_caster_factory()
         items, textures = plan.items, plan.textures
         texture_ids = {name: i for i, name in enumerate(textures)}
         self.lamps = plan.lighting.lamps
@@ -68,6 +68,7 @@ class HomeScene:
         albedo = np.array([cv2.mean(material.rgb)[:3] for material in textures.values()]) / 255.0
         self._embree = new_caster(corners_m.astype(np.float32))
         light = vertex_light(merged, albedo[texture], self, plan.lighting, plan.seed)
+        uv_per_m = _uv_per_m(corners_m, uv)
         self.triangles = Triangles(
             uv=uv.astype(np.float32),
             light=light[merged.faces],
@@ -76,7 +77,8 @@ class HomeScene:
             texture=texture,
             item=np.repeat([i for i, _ in parts], counts),
             gloss=np.array([material.gloss for material in textures.values()], np.float32)[texture],
-            texels_per_m=_texels_per_m(corners_m, uv),
+            uv_per_m=uv_per_m,
+            mean_uv_per_m=np.sqrt(np.linalg.norm(np.cross(uv_per_m[:, 0], uv_per_m[:, 1]), axis=1)),
         )
 
     def cast(self, origins_m: Float32[ndarray, "r 3"], directions: Float32[ndarray, "r 3"]) -> Hits:
@@ -100,12 +102,7 @@ class HomeScene:
         return np.asarray(free >= 0)
 
 
-def require_ray_caster() -> None:
-    """Raise DatasetError without the extra `sim`, before a home is built."""
-    _ray_caster()
-
-
-def _ray_caster() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:
+def ray_caster_factory() -> Callable[[Float32[ndarray, "m 3 3"]], Any]:
     """Return the factory of ray casters. Raises DatasetError without the extra `sim`."""
     try:
         from embreex.mesh_construction import TriangleMesh
@@ -129,10 +126,8 @@ def _unit_normals(corners_m: Float64[ndarray, "m 3 3"]) -> Float32[ndarray, "m 3
     return np.asarray(normals / length, np.float32)
 
 
-def _texels_per_m(corners_m: Float64[ndarray, "m 3 3"], uv: Float64[ndarray, "m 3 2"]) -> Float32[ndarray, " m"]:
-    """Return each triangle's texels per metre, from its areas in texture space and in the world."""
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    texture_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    world_area = np.linalg.norm(np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]), axis=1)
-    ratio: NDArray[np.float64] = SIDE_PX * np.sqrt(texture_area / np.maximum(world_area, 1e-12))
-    return ratio.astype(np.float32)
+def _uv_per_m(corners_m: Float64[ndarray, "m 3 3"], uv: Float64[ndarray, "m 3 2"]) -> Float32[ndarray, "m 2 3"]:
+    """Return the gradients of each triangle's texture coordinates in its plane."""
+    sides_m, sides_uv = (values[:, 1:] - values[:, :1] for values in (corners_m, uv))
+    gradients: NDArray[np.float64] = np.swapaxes(np.linalg.pinv(sides_m) @ sides_uv, 1, 2)
+    return gradients.astype(np.float32)

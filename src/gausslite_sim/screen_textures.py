@@ -5,8 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gausslite_sim.label_textures import DARK_INK, FONT, SMALL_FONT, any_word, ink_of, paragraph
+from gausslite_sim.label_textures import DARK_INK, SMALL_FONT, any_word, paragraph
+from gausslite_sim.printed_textures import FONT, ink_of, write
 from gausslite_sim.textures import SIDE_PX, Texture, grain, noise, tint
+
+_SCRIPT = cv2.FONT_HERSHEY_SCRIPT_SIMPLEX
 
 
 def keys(rng: np.random.Generator) -> Texture:
@@ -21,16 +24,8 @@ def keys(rng: np.random.Generator) -> Texture:
             high = (round((k + 1) * wide) - 3, row * 85 + 79)
             tone = int(rng.integers(44, 66))
             cv2.rectangle(picture, low, high, (tone, tone, tone + 3), -1)
-            cv2.putText(
-                picture,
-                letters[(row * 7 + k) % 36],
-                (low[0] + 5, low[1] + 40),
-                SMALL_FONT,
-                0.9,
-                (215, 215, 220),
-                thickness=2,
-                lineType=cv2.LINE_AA,
-            )
+            letter = letters[(row * 7 + k) % 36]
+            write(picture, letter, (low[0] + 5, low[1] + 40), 0.9, (215, 215, 220), (SMALL_FONT, 2))
     return Texture(picture)
 
 
@@ -40,13 +35,11 @@ def code_screen(rng: np.random.Generator) -> Texture:
     cv2.rectangle(picture, (0, 0), (110, SIDE_PX), (34, 37, 50), -1)
     inks = ((120, 180, 240), (230, 150, 110), (150, 210, 130), (214, 214, 220), (200, 130, 220))
     for y in range(24, 508, 21):
-        cv2.putText(picture, any_word(rng), (8, y), SMALL_FONT, 0.5, (150, 155, 170), thickness=1, lineType=cv2.LINE_AA)
+        write(picture, any_word(rng), (8, y), 0.5, (150, 155, 170), (SMALL_FONT, 1))
         x = 124 + 24 * int(rng.integers(0, 4))
         while x < 430 and rng.random() < 0.86:
             word = any_word(rng)
-            cv2.putText(
-                picture, word, (x, y), SMALL_FONT, 0.56, inks[int(rng.integers(5))], thickness=2, lineType=cv2.LINE_AA
-            )
+            write(picture, word, (x, y), 0.56, inks[int(rng.integers(5))], (SMALL_FONT, 2))
             x += 13 * len(word) + 8
     return Texture(picture, gloss=0.14)
 
@@ -55,7 +48,7 @@ def slide_screen(rng: np.random.Generator) -> Texture:
     """A slide with a title, bars and bullet points."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), (238, 240, 244), np.uint8)
     cv2.rectangle(picture, (0, 0), (SIDE_PX, 84), (30, 62, 110), -1)
-    cv2.putText(picture, "QUARTER 3", (24, 62), FONT, 2.0, (250, 250, 250), thickness=5, lineType=cv2.LINE_AA)
+    write(picture, "QUARTER 3", (24, 62), 2.0, (250, 250, 250), (FONT, 5))
     for i in range(6):
         top = int(rng.integers(150, 400))
         cv2.rectangle(picture, (30 + 40 * i, top), (58 + 40 * i, 450), ink_of(rng.integers(40, 220, 3)), -1)
@@ -94,7 +87,7 @@ def clock_face(rng: np.random.Generator) -> Texture:
     for hour in range(1, 13):
         a = np.pi * hour / 6
         at = (round(236 + 180 * np.sin(a)) - 14 * (hour > 9), round(272 - 180 * np.cos(a)))
-        cv2.putText(picture, str(hour), at, FONT, 1.7, DARK_INK, thickness=5, lineType=cv2.LINE_AA)
+        write(picture, str(hour), at, 1.7, DARK_INK, (FONT, 5))
     for k in range(60):
         a = np.pi * k / 30
         ends = [(round(256 + r * np.sin(a)), round(256 - r * np.cos(a))) for r in (228, 246)]
@@ -111,16 +104,7 @@ def whiteboard(rng: np.random.Generator) -> Texture:
     for i in range(4):
         low = (30 + 120 * i, 60 + 26 * (i % 2))
         cv2.rectangle(picture, low, (low[0] + 84, low[1] + 60), pens[i], 4, cv2.LINE_AA)
-        cv2.putText(
-            picture,
-            any_word(rng),
-            (low[0] + 8, low[1] + 38),
-            cv2.FONT_HERSHEY_SCRIPT_SIMPLEX,
-            0.9,
-            pens[i],
-            thickness=2,
-            lineType=cv2.LINE_AA,
-        )
+        write(picture, any_word(rng), (low[0] + 8, low[1] + 38), 0.9, pens[i], (_SCRIPT, 2))
         cv2.arrowedLine(picture, (low[0] + 86, low[1] + 30), (low[0] + 118, low[1] + 34), pens[3], 3, cv2.LINE_AA)
     cv2.polylines(
         picture, [np.array([(40, 420), (110, 330), (170, 380), (240, 250)], np.int32)], False, pens[1], 5, cv2.LINE_AA
@@ -129,16 +113,7 @@ def whiteboard(rng: np.random.Generator) -> Texture:
         cv2.arrowedLine(picture, *ends, pens[3], 4, cv2.LINE_AA)
     for y in range(240, 480, 34):
         text = " ".join(any_word(rng) for _ in range(2))
-        cv2.putText(
-            picture,
-            text,
-            (290, y),
-            cv2.FONT_HERSHEY_SCRIPT_SIMPLEX,
-            1.0,
-            pens[(y // 34) % 4],
-            thickness=2,
-            lineType=cv2.LINE_AA,
-        )
+        write(picture, text, (290, y), 1.0, pens[(y // 34) % 4], (_SCRIPT, 2))
     cv2.rectangle(picture, (0, 0), (SIDE_PX - 1, SIDE_PX - 1), (150, 152, 156), 12)
     return Texture(picture, gloss=0.15)
 

@@ -101,9 +101,8 @@ def bench(length_m: float, wood: str, pad: str | None = None) -> list[Part]:
     feet = [box((x - 0.02, -0.14, 0), (x + 0.02, 0.14, 0.41)) for x in (-length_m / 2 + 0.12, length_m / 2 - 0.12)]
     parts = [Part(merge_meshes([top, *feet]), wood)]
     if pad is not None:
-        parts.append(
-            Part(pillow(length_m - 0.1, 0.32, 0.06, fit=False).rotate_x(np.pi / 2).translate((0, 0.16, 0.475)), pad)
-        )
+        cushion = pillow(length_m - 0.1, 0.32, 0.06, fit=False).rotate_x(np.pi / 2)
+        parts.append(Part(cushion.translate((0, 0.16, 0.475)), pad))
     return parts
 
 
@@ -126,9 +125,8 @@ def bed(width_m: float, frame: str, cover: str, pillows: tuple[str, ...], throw:
         x = -half + (i % 2 + 0.5) * half
         lean, y, z = (-30, 0.72, 0.52) if i < 2 else (-38, 0.52, 0.54)
         size = (0.66 * half / 0.8, 0.42) if i < 2 else (0.42, 0.42)
-        parts.append(
-            Part(pillow(*size, 0.15), texture).rotate_x(lean).place((x * (1 if i < 2 else 0.5), y, z), 3 * i - 4)
-        )
+        leaning = Part(pillow(*size, 0.15), texture).rotate_x(lean)
+        parts.append(leaning.place((x * (1 if i < 2 else 0.5), y, z), 3 * i - 4))
     if throw is not None:
         parts.append(Part(draped(width_m + 0.06, 0.5, 0.3).translate((0, -0.72, 0.55)), throw))
     return parts

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray
@@ -10,29 +12,60 @@ from gausslite_sim.scene import NO_HIT, Hits, HomeScene
 
 _WHITE = 255.0
 _LIFT_M = 3e-3
-_HEAD_ON = 0.35
+HEAD_ON = 0.35
 """Reflectance at normal incidence relative to grazing incidence (Schlick 1994)."""
 _BLUR_PER_M = 0.06
 """Blur width of reflections in metres per metre of reflected ray: polished surfaces, not mirrors."""
+_GRAZING = 1e-4
+"""Least |cos| of incidence with which footprints are computed."""
 _HIGHLIGHT_EXPONENT = 90.0
 _HIGHLIGHT = 2.5
 
 
-def facing_of(scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"]) -> Float32[ndarray, " n"]:
-    """Return |cos| of the angle of incidence."""
-    along = np.einsum("nc,nc->n", directions, scene.triangles.normal[hits.triangle])
-    facing: Float32[ndarray, " n"] = np.abs(along) / np.sqrt(np.einsum("nc,nc->n", directions, directions))
-    return facing
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Texture coordinates, light and |cos| of the angle of incidence at hits."""
+
+    uv: Float32[ndarray, "n 2"]
+    light: Float32[ndarray, "n 3"]
+    facing: Float32[ndarray, " n"]
+
+    @classmethod
+    def of(cls, scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"]) -> Surface:
+        """Return the surface at hits; its light is 0 without a hit."""
+        table, triangle, weights = scene.triangles, hits.triangle, _corner_weights(hits)
+        along = np.abs(np.einsum("nc,nc->n", directions, table.normal[triangle]))
+        light = np.einsum("nk,nkc->nc", weights, table.light[triangle])
+        light *= (triangle != NO_HIT)[:, None]
+        return cls(
+            np.einsum("nk,nkc->nc", weights, table.uv[triangle]),
+            light,
+            along / np.sqrt(np.einsum("nc,nc->n", directions, directions)),
+        )
 
 
-def diffuse_colour(scene: HomeScene, hits: Hits, pixel_m: Float32[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
+def uv_step(
+    scene: HomeScene, hits: Hits, directions: Float32[ndarray, "n 3"], turns: Float32[ndarray, "n 3"]
+) -> Float32[ndarray, "n 2"]:
+    """Return the change of the texture coordinates in each hit's plane when its ray's direction changes."""
+    normal = scene.triangles.normal[hits.triangle]
+    along = np.einsum("nc,nc->n", normal, directions)
+    along = np.where(np.abs(along) < _GRAZING, _GRAZING, along)
+    step_m = turns - directions * (np.einsum("nc,nc->n", normal, turns) / along)[:, None]
+    step_m *= np.where(hits.triangle == NO_HIT, np.float32(0), hits.distance)[:, None]
+    steps: Float32[ndarray, "n 2"] = np.einsum("nac,nc->na", scene.triangles.uv_per_m[hits.triangle], step_m)
+    return steps
+
+
+def diffuse_colour(
+    scene: HomeScene, hits: Hits, surface: Surface, pixel_m: Float32[ndarray, " n"]
+) -> Float32[ndarray, "n 3"]:
     """Texture times light, 0 to 255, of pixels this wide on the surface; black where nothing is hit."""
-    table, triangle = scene.triangles, hits.triangle
-    weights = _corner_weights(hits)
-    uv = np.einsum("nk,nkc->nc", weights, table.uv[triangle])
-    light = np.einsum("nk,nkc->nc", weights, table.light[triangle])
-    rgb = scene.atlas.sample(table.texture[triangle], uv, pixel_m * table.texels_per_m[triangle])
-    rgb *= light * (triangle != NO_HIT)[:, None]
+    sides = np.zeros((2, len(pixel_m), 2), np.float32)
+    # a square with the area of the footprint
+    sides[0, :, 0] = sides[1, :, 1] = pixel_m * scene.triangles.mean_uv_per_m[hits.triangle]
+    rgb = scene.atlas.mean(scene.triangles.texture[hits.triangle], surface.uv, sides, taps=1)
+    rgb *= surface.light
     return rgb
 
 
@@ -54,9 +87,10 @@ def add_reflections(
     reflected = incoming + 2 * cosine[:, None] * normals
     points = origins_m[glossy] + hits.distance[glossy, None] * directions[glossy] + np.float32(_LIFT_M) * normals
     strength = scene.triangles.gloss[triangle[glossy]]
-    share = strength * (_HEAD_ON + (1 - _HEAD_ON) * (1 - np.clip(cosine, 0, 1)) ** 5)
+    share = strength * (HEAD_ON + (1 - HEAD_ON) * (1 - np.clip(cosine, 0, 1)) ** 5)
     second_hits = scene.cast(np.ascontiguousarray(points, np.float32), np.ascontiguousarray(reflected, np.float32))
-    reflection = diffuse_colour(scene, second_hits, np.float32(_BLUR_PER_M) * np.minimum(second_hits.distance, 10.0))
+    blur_m = np.float32(_BLUR_PER_M) * np.minimum(second_hits.distance, 10.0)
+    reflection = diffuse_colour(scene, second_hits, Surface.of(scene, second_hits, reflected), blur_m)
     rgb[glossy] += share[:, None] * (reflection - rgb[glossy])
     rgb[glossy] += strength[:, None] * _highlights(scene, points, reflected)
 

@@ -110,13 +110,9 @@ def shell(length_m: float, width_m: float, heights_m: tuple[float, ...]) -> Mesh
 
 def legs(width_m: float, depth_m: float, height_m: float, thick_m: float = 0.03, splay_m: float = 0.0) -> Mesh:
     """Return four legs from the floor to the corners of a seat or top; splay_m moves the feet outwards."""
+    x, y, out = width_m / 2, depth_m / 2, splay_m
     pairs: list[tuple[Vector, Vector]] = [
-        (
-            (sx * (width_m / 2 + splay_m), sy * (depth_m / 2 + splay_m), 0.0),
-            (sx * width_m / 2, sy * depth_m / 2, height_m),
-        )
-        for sx in (-1, 1)
-        for sy in (-1, 1)
+        ((sx * (x + out), sy * (y + out), 0.0), (sx * x, sy * y, height_m)) for sx in (-1, 1) for sy in (-1, 1)
     ]
     if splay_m > 0:
         return rods(pairs, thick_m / 2)

@@ -114,13 +114,8 @@ def shoes(upper: str, sole: str = "white_plastic") -> list[Part]:
 
 def pen_cup(colour: str) -> list[Part]:
     """A cup of pens."""
-    pens = rods(
-        [
-            ((0.0, 0.0, 0.02), (0.035 * float(np.cos(a)), 0.035 * float(np.sin(a)), 0.17))
-            for a in np.linspace(0, 5.5, 6)
-        ],
-        0.004,
-    )
+    tips = [(0.035 * float(np.cos(a)), 0.035 * float(np.sin(a)), 0.17) for a in np.linspace(0, 5.5, 6)]
+    pens = rods([((0.0, 0.0, 0.02), tip) for tip in tips], 0.004)
     return [
         Part(lathe([(0.035, 0), (0.038, 0.1), (0.035, 0.1), (0.033, 0.01), (0.0005, 0.01)]), colour),
         Part(pens, "paint_red"),
@@ -140,7 +135,7 @@ def desk_clock(face: str) -> list[Part]:
 
 def wall_clock(face: str) -> list[Part]:
     """A round clock on a wall at y = 0, its centre at z = 0."""
-    rim = lathe([(0.0005, 0.0), (0.17, 0.0), (0.17, 0.04), (0.155, 0.04)]).rotate_x(np.pi / 2)
+    rim = lathe([(0.0005, 0.003), (0.17, 0.003), (0.17, 0.04), (0.155, 0.04)]).rotate_x(np.pi / 2)
     return [
         Part(rim, "black_plastic"),
         Part(panel((-0.125, -0.0385, 0.125), (0.25, 0, 0), (0, 0, -0.25), fit=True), face),

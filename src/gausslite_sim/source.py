@@ -30,7 +30,7 @@ from gausslite_sim.moving_box import box_centre_m, with_box
 from gausslite_sim.odometry_drift import drifting_poses
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
-from gausslite_sim.scene import HomeScene, require_ray_caster
+from gausslite_sim.scene import HomeScene, ray_caster_factory
 from gausslite_sim.sensor import colour_image, noisy_colour, noisy_depth
 from gausslite_sim.trajectory import TrajectorySampler, walked_laps
 from gausslite_sim.view import View, render_view
@@ -69,7 +69,7 @@ class SimulatedHome(Source):
     """
 
     def __init__(self, settings: HomeSettings, up_axis: UpAxis | None = None) -> None:
-        require_ray_caster()
+        ray_caster_factory()
         width, height = settings.size_px
         self._settings = settings
         self._camera = Camera.centred(_FOCAL_PER_WIDTH * width, width, height)

@@ -17,10 +17,7 @@ def plain_table(
     """A top on four legs."""
     x, y = width_m / 2, depth_m / 2
     slab = box((-x, -y, height_m - 0.035), (x, y, height_m), cell_m=0.05)
-    return [
-        Part(slab, top),
-        Part(legs(width_m - 0.12, depth_m - 0.12, height_m - 0.035, 0.045, splay_m), feet),
-    ]
+    return [Part(slab, top), Part(legs(width_m - 0.12, depth_m - 0.12, height_m - 0.035, 0.045, splay_m), feet)]
 
 
 def desk(width_m: float, top: str, body: str, drawers: str | None = None) -> list[Part]:

@@ -104,10 +104,8 @@ def wallpaper(rng: np.random.Generator, ground: Colour, motif: Colour) -> Textur
         for column in range(-1, 5):
             centre = (column * pitch + (row % 2) * pitch // 2 + pitch // 2, row * pitch + pitch // 2)
             for turn in (-50, 0, 50):
-                tip = (
-                    centre[0] + round(26 * np.sin(np.radians(turn))),
-                    centre[1] - round(26 * np.cos(np.radians(turn))),
-                )
+                across, down = (round(26 * f(np.radians(turn))) for f in (np.sin, np.cos))
+                tip = (centre[0] + across, centre[1] - down)
                 cv2.ellipse(mask, tip, (9, 26), turn, 0, 360, color=255, thickness=-1, lineType=cv2.LINE_AA)
             cv2.line(mask, centre, (centre[0], centre[1] + 34), 255, 4, cv2.LINE_AA)
     alpha = (mask / 255.0)[..., None]

@@ -1,4 +1,4 @@
-"""Render a home: exact depth, exact instances, and colour anti-aliased at edges."""
+"""Render a home: exact depth and instances of the pixels' centres, and the mean colour over each pixel."""
 
 from __future__ import annotations
 
@@ -9,16 +9,26 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite_sim.ray_camera import RayCamera, Rays
+from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.scene import NO_HIT, Hits, HomeScene
-from gausslite_sim.shading import add_reflections, diffuse_colour, facing_of
+from gausslite_sim.shading import HEAD_ON, Surface, add_reflections, diffuse_colour, uv_step
+from gausslite_sim.textures import SIDE_PX
 
-_SUBSAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)], np.float32)
-"""Offsets of the anti-aliasing rays from a pixel's centre, in pixels."""
-_STEP = 0.03
-"""Neighbours whose relative depth difference exceeds this lie on different surfaces."""
-_CREASE = 0.1
-"""Neighbours whose cosines of incidence differ by more than this lie on different faces."""
+_UV_TOLERANCE = 0.15
+"""Greatest error of a predicted texture coordinate, as a share of the pixel's footprint."""
+_LIGHT_TOLERANCE = 0.06
+"""Greatest difference of the light in a pixel's centre and corners, about 1 under a lamp."""
+_REFLECTION_TOLERANCE = 6.0
+"""Greatest difference of the reflections in two neighbouring pixels, of 255."""
+_SPREAD = 24.0
+"""Standard deviation of the first rays' colours, of 255, from which a pixel gets all of them."""
+_TAPS = 6
+"""Texture look-ups along the shorter side of a pixel without an edge."""
+_FEW, _MANY = 16, 64
+"""Rays of a pixel with an edge, and of one where the colours of the first ones differ."""
+_ORDER = np.argsort(np.arange(_MANY) % 4 != 2, kind="stable")
+PIXEL_RAYS_PX = ((np.stack([_ORDER, 19 * _ORDER % _MANY], axis=1) + 0.5) / _MANY - 0.5).astype(np.float32)
+"""Offsets of rays from a pixel's centre: a lattice of _MANY; the first _FEW of them are a lattice too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,24 +47,25 @@ class View:
 
 def render_view(scene: HomeScene, camera: RayCamera) -> View:
     """Return one view; depth is that of the ray through the pixel's centre, along the optical axis of its row."""
-    shape = camera.shape
-    pixels = camera.pixels()
-    rays = camera.rays(pixels, *camera.centres(pixels))
+    shape, pixels = camera.shape, camera.pixels()
+    columns, rows = camera.centres(pixels)
+    rays = camera.rays(pixels, columns, rows)
     hits = scene.cast(rays.origins_m, rays.directions)
-    depth_m = _depth(hits)
-    rgb, facing = _shade(scene, hits, rays, camera)
-    item = np.where(hits.triangle == NO_HIT, NO_HIT, scene.triangles.item[hits.triangle])
-    texture = scene.triangles.texture[hits.triangle]
-    edge = np.flatnonzero(_edges(*(image.reshape(shape) for image in (item, texture, depth_m, facing))))
-    if len(edge):
-        columns, rows = camera.centres(edge)
-        fine_columns = (columns[:, None] + _SUBSAMPLES[:, 0]).ravel()
-        fine_rows = (rows[:, None] + _SUBSAMPLES[:, 1]).ravel()
-        fine = camera.rays(np.repeat(edge, len(_SUBSAMPLES)), fine_columns, fine_rows)
-        fine_rgb, _ = _shade(scene, scene.cast(fine.origins_m, fine.directions), fine, camera)
-        rgb[edge] = fine_rgb.reshape(-1, len(_SUBSAMPLES), 3).mean(axis=1)
-    gloss = np.where(hits.triangle == NO_HIT, np.float32(0), scene.triangles.gloss[hits.triangle])
-    return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in (depth_m, item, facing, gloss)))
+    surface = Surface.of(scene, hits, rays.directions)
+    turns = (camera.rays(pixels, columns + 0.5, rows), camera.rays(pixels, columns, rows + 0.5))
+    steps = np.stack([uv_step(scene, hits, rays.directions, 2 * (t.directions - rays.directions)) for t in turns])
+    rgb = scene.atlas.mean(scene.triangles.texture[hits.triangle], surface.uv, steps, _TAPS) * surface.light
+    matt = rgb.copy()
+    add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
+    is_hit = hits.triangle != NO_HIT
+    item = np.where(is_hit, scene.triangles.item[hits.triangle], NO_HIT)
+    gloss = np.where(is_hit, scene.triangles.gloss[hits.triangle], np.float32(0))
+    uneven = _edges(scene, camera, hits, surface, steps)
+    uneven |= _steps_between((rgb - matt * (1 - HEAD_ON * gloss[:, None])).reshape(*shape, 3)).ravel()
+    edge = np.flatnonzero(uneven)
+    rgb[edge] = _ray_means(scene, camera, edge)
+    images = (np.where(is_hit, hits.distance, np.float32(0)), item, surface.facing, gloss)
+    return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in images))
 
 
 def render_instances(
@@ -72,34 +83,68 @@ def render_instances(
     return item.reshape(ray_camera.shape)
 
 
-def _depth(hits: Hits) -> Float32[ndarray, " n"]:
-    return np.where(hits.triangle == NO_HIT, np.float32(0), hits.distance)
-
-
-def _shade(
-    scene: HomeScene, hits: Hits, rays: Rays, camera: RayCamera
-) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, " n"]]:
-    """Return the shaded colour of each hit, black without a hit, and |cos| of the incidence."""
-    facing = facing_of(scene, hits, rays.directions)
-    # geometric mean of the pixel's footprints across and along the slope
-    pixel_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(np.maximum(facing, 0.05))
-    rgb = diffuse_colour(scene, hits, pixel_m)
-    add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
-    return rgb, facing
-
-
 def _edges(
-    item: Int64[ndarray, "h w"],
-    texture: Int64[ndarray, "h w"],
-    depth_m: Float32[ndarray, "h w"],
-    facing: Float32[ndarray, "h w"],
-) -> Bool[ndarray, "h w"]:
-    """Return the mask of pixels next to another object, another surface or a crease."""
-    edge = np.zeros(item.shape, np.bool_)
+    scene: HomeScene, camera: RayCamera, hits: Hits, surface: Surface, steps: Float32[ndarray, "2 n 2"]
+) -> Bool[ndarray, " n"]:
+    """Return the pixels with a corner that shows another texture, or other coordinates or light than predicted."""
+    table, (height, width) = scene.triangles, camera.shape
+    corner_row, corner_column = np.divmod(np.arange((height + 1) * (width + 1)), width + 1)
+    exposed = np.minimum(corner_row, height - 1) * width
+    rays = camera.rays(exposed, corner_column.astype(np.float32), corner_row.astype(np.float32))
+    corners = scene.cast(rays.origins_m, rays.directions)
+    footprint = np.maximum(np.abs(steps).max(axis=(0, 2)), np.float32(1 / SIDE_PX))
+    row, column = np.divmod(camera.pixels(), width)
+    edge = np.zeros(len(row), np.bool_)
+    for below, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        at = (row + below) * (width + 1) + column + right
+        # within one triangle the prediction holds
+        other = np.flatnonzero(corners.triangle[at] != hits.triangle)
+        at = at[other]
+        found = Hits(corners.triangle[at], corners.barycentric[at], corners.distance[at])
+        seen = Surface.of(scene, found, rays.directions[at])
+        predicted = surface.uv[other] + (right - 0.5) * steps[0][other] + (below - 0.5) * steps[1][other]
+        error = seen.uv - predicted
+        differs = np.abs(error - np.rint(error)).max(axis=1) > _UV_TOLERANCE * footprint[other]
+        differs |= np.abs(seen.light - surface.light[other]).max(axis=1) > _LIGHT_TOLERANCE
+        for values in (table.texture, table.item):
+            differs |= values[found.triangle] != values[hits.triangle[other]]
+        edge[other] |= differs
+    return edge
+
+
+def _steps_between(reflections: Float32[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:
+    """Return the pixels next to one with another reflection."""
+    edge = np.zeros(reflections.shape[:2], np.bool_)
     for a, b in (((slice(None), slice(1, None)), (slice(None), slice(-1))), ((slice(1, None),), (slice(-1),))):
-        differs = (item[a] != item[b]) | (texture[a] != texture[b])
-        differs |= np.abs(depth_m[a] - depth_m[b]) > _STEP * depth_m[a]
-        differs |= np.abs(facing[a] - facing[b]) > _CREASE
+        differs = np.abs(reflections[a] - reflections[b]).max(axis=2) > _REFLECTION_TOLERANCE
         edge[a] |= differs
         edge[b] |= differs
     return edge
+
+
+def _ray_means(scene: HomeScene, camera: RayCamera, pixels: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
+    """Return the mean colours of few rays in each pixel, or of many where the colours of the few differ."""
+    few = _ray_colours(scene, camera, pixels, PIXEL_RAYS_PX[:_FEW])
+    sums = few.sum(axis=1)
+    means: Float32[ndarray, "n 3"] = sums / np.float32(_FEW)
+    uneven = np.flatnonzero(few.std(axis=1).max(axis=1) > _SPREAD)
+    more = _ray_colours(scene, camera, pixels[uneven], PIXEL_RAYS_PX[_FEW:])
+    means[uneven] = (sums[uneven] + more.sum(axis=1)) / np.float32(_MANY)
+    return means
+
+
+def _ray_colours(
+    scene: HomeScene, camera: RayCamera, pixels: Int64[ndarray, " n"], offsets: Float32[ndarray, "k 2"]
+) -> Float32[ndarray, "n k 3"]:
+    """Return the colours of rays through each pixel's centre plus these offsets."""
+    columns, rows = (
+        (centre[:, None] + offset).ravel() for centre, offset in zip(camera.centres(pixels), offsets.T, strict=True)
+    )
+    rays = camera.rays(np.repeat(pixels, len(offsets)), columns, rows)
+    hits = scene.cast(rays.origins_m, rays.directions)
+    surface = Surface.of(scene, hits, rays.directions)
+    # geometric mean of a ray's footprints across and along the slope
+    width_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(_MANY * np.maximum(surface.facing, 0.05))
+    rgb = diffuse_colour(scene, hits, surface, width_m)
+    add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
+    return rgb.reshape(len(pixels), len(offsets), 3)

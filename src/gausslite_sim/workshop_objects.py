@@ -80,19 +80,11 @@ def wheel() -> list[Part]:
     """A bicycle's wheel in the x-z plane: tyre, rim, hub and spokes."""
     tyre = ring(0.33, 0.018, 0, 2 * np.pi).translate((0, 0, 0.35))
     rim = ring(0.305, 0.008, 0, 2 * np.pi).translate((0, 0, 0.35))
-    spokes = rods(
-        [
-            ((0, 0.02 * (-1) ** i, 0.35), (0.3 * float(np.cos(a)), 0, 0.35 + 0.3 * float(np.sin(a))))
-            for i, a in enumerate(np.linspace(0, 2 * np.pi, 19)[:-1])
-        ],
-        0.0022,
-    )
-    hub = (
-        lathe([(0.0005, -0.04), (0.02, -0.04), (0.02, 0.04), (0.0005, 0.04)], sectors=12)
-        .rotate_x(np.pi / 2)
-        .translate((0, 0, 0.35))
-    )
-    return [Part(tyre, "rubber"), Part(merge_meshes([rim, spokes, hub]), "steel")]
+    turns = np.linspace(0, 2 * np.pi, 19)[:-1]
+    ends = [(0.3 * float(np.cos(a)), 0.0, 0.35 + 0.3 * float(np.sin(a))) for a in turns]
+    spokes = rods([((0.0, 0.02 * (-1) ** i, 0.35), end) for i, end in enumerate(ends)], 0.0022)
+    hub = lathe([(0.0005, -0.04), (0.02, -0.04), (0.02, 0.04), (0.0005, 0.04)], sectors=12).rotate_x(np.pi / 2)
+    return [Part(tyre, "rubber"), Part(merge_meshes([rim, spokes, hub.translate((0, 0, 0.35))]), "steel")]
 
 
 def helmet(colour: str) -> list[Part]:

@@ -29,7 +29,7 @@ def run(tmp_path: Path) -> Path:
 def test_a_question_lists_and_counts_the_objects(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["objects", str(run), "how many mugs are on the table"]) == 0
     line, count = capsys.readouterr().out.splitlines()
-    assert line.startswith("mug (target) run/mug-1: at (0.25, 0.50, 1.00) m")
+    assert line.startswith("mug (target) mug-1: at (0.25, 0.50, 1.00) m")
     assert line.endswith("seen by run at 2011-05-10 12:40:30 UTC")
     assert count == "1 object"
     assert main(["objects", str(run), "what is on the shelf"]) == 1

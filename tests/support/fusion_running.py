@@ -38,6 +38,7 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
+from gausslite.render.rasterizer import gaussians_to_rows
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
@@ -175,6 +176,13 @@ def frame(index: int, camera: Camera = CAMERA, T_world_camera: np.ndarray | None
         camera,
         np.eye(4) if T_world_camera is None else T_world_camera,
     )
+
+
+def photograph(index: int, cells: dict[int, Sequence[int]]) -> Frame:
+    """A view of the map of these cells, a little brighter than the map."""
+    rendering = ReferenceRasterizer().forward(gaussians_to_rows(make_batch(cells).gaussians), CAMERA, np.eye(4))
+    rgb = np.clip(np.rint(rendering.rgb * 255) + 9, 0, 255).astype(np.uint8)
+    return replace(frame(index), rgb=rgb, depth_m=rendering.expected_depth_m())
 
 
 def red_frame(index: int) -> Frame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -14,6 +15,8 @@ from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.fusion.refinement import CreateRasterizer, Refinement, RefineProgress, RefineSettings
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.views import ChangeNotifier
+
+_log = logging.getLogger(__name__)
 
 
 class RefinementWorker:
@@ -43,13 +46,15 @@ class RefinementWorker:
             progress_notifier.notify()
 
         def work() -> None:
-            gaussians, keyframes, revision = engine.refinement_input()
-            refinement = Refinement(gaussians, keyframes, self.create_rasterizer(), settings)
+            vote = engine.refinement_input()
+            refinement = Refinement(vote, self.create_rasterizer(), settings)
+            for line in refinement.left_out:
+                _log.warning("refinement: left out, because they disagree with the vote: %s", line)
             for progress in refinement.steps():
                 loop.call_soon_threadsafe(publish, progress)
                 if cancelled.is_set():
                     return
-            engine.store_refined(refinement.result(), revision)
+            engine.store_refined(refinement.result(), vote.revision, refinement.sources)
 
         future = loop.run_in_executor(self._worker, work)
         future.add_done_callback(lambda _: self._finish(progress_notifier))

@@ -24,7 +24,7 @@ from gausslite.fusion.alignment import FrameAligner, FrameDecisions, TeamView
 from gausslite.fusion.epochs import MAX_FORMER_MAPS, agent_of, is_former
 from gausslite.fusion.frames import RECORD as ALIGNMENT
 from gausslite.fusion.frames import FrameAlignments
-from gausslite.fusion.fused_map import FusedMapLayers, MapLayer, load_refinement, save_refinement
+from gausslite.fusion.fused_map import REFINEMENT, FusedMapLayers, MapLayer, load_refinement, save_refinement
 from gausslite.fusion.keyframe_pool import (
     ORDER_RECORD,
     AgentKeyframe,
@@ -37,6 +37,7 @@ from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.objects import RECORD as OBJECTS
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
+from gausslite.fusion.refinement_views import RefineInput
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.update_log import PutOutcome
@@ -93,7 +94,7 @@ class FusionEngine:
         self.traffic = traffic or TrafficLog()
         self.queue, self.members = UpdateQueue(), Membership(store, settings)
         self.keyframes = KeyframePool(store, settings.quotas, decode_keyframe)
-        self.objects, self._merged_objects = TeamObjects(store), MergedObjects()
+        self.objects, self._merged_objects = TeamObjects(store), MergedObjects(store)
         self.frames = FrameAlignments(store, are_compared=aligner is not None)
         frames = {name: alignment for name, (_, alignment) in self.frames.by_rank().items()}
         first = time.time_ns() // 1000 if first_revision is None else first_revision
@@ -338,25 +339,39 @@ class FusionEngine:
         moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in unused)
         return [keyframe for keyframe in moved if keyframe is not None]
 
-    def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
-        """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
+    def refinement_input(self) -> RefineInput:
+        """Return the fused map and all agents' keyframes. Raises MismatchError if one is empty."""
         # before the map is read: what changes meanwhile counts as changed
-        revision, gaussians = self.maps.revision(), self.maps.voted_map().gaussians
+        revision, (voted, regions) = self.maps.revision(), self.maps.voted_regions()
         encoded = self.keyframes.read(self.keyframes.names())
-        if not encoded or len(gaussians) == 0:
+        if not encoded or len(voted.gaussians) == 0:
             raise MismatchError(
-                f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
+                f"refinement: expected a fused map and keyframes, got {len(voted.gaussians)} Gaussians and "
                 f"{len(encoded)} keyframes; agents send keyframes with handover = true"
             )
-        return gaussians, self.in_fused_frame(self.keyframes.decode(encoded)), revision
+        keyframes = self.in_fused_frame(self.keyframes.decode(encoded))
+        return RefineInput(voted.gaussians, keyframes, regions, self.grid, revision)
 
-    def store_refined(self, gaussians: Gaussians, revision: int) -> None:
-        """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
-        shown = self.maps.show_refined(gaussians, revision)
+    def store_refined(self, gaussians: Gaussians, revision: int, sources: tuple[str, ...]) -> None:
+        """Store the result of a refinement of the vote at this revision, shaped by these agents' keyframes.
+
+        Raises RevisionGoneError, StorageError, MismatchError if one of them has been evicted meanwhile.
+        """
+        shown = self.maps.show_refined(gaussians, revision, sources)
         # no update may be in the store without being in the change log
         with self._changing:
             changed = self.maps.changed_since(revision)
         save_refinement(self.store, shown.without(changed))
+        if gone := [name for name in sources if not self.keyframes.count(name)]:
+            self._drop_refined(gone[0])
+            raise MismatchError(f"refinement: expected the keyframes of {', '.join(gone)} to stay, got them deleted")
+
+    def _drop_refined(self, agent_id: str) -> None:
+        """Show the vote in place of a refined map that the agent's keyframes shaped, also after a restart."""
+        if self.maps.is_refined_by(agent_id):
+            self.store.remove_record(*REFINEMENT)
+            self.maps.drop_refined()
+            _log.info("the refined map is dropped, as keyframes of %s shaped it; the vote is shown", agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
@@ -372,12 +387,16 @@ class FusionEngine:
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
 
-        ban: refuse later joins under this name, also after a restart. The name of a former map deletes only that.
-        Raises InvalidInputError for an unknown agent that is not banned, StorageError.
+        A refined map that its keyframes shaped is dropped. ban: refuse later joins under this name, also after a
+        restart. The name of a former map deletes only that. Raises InvalidInputError for an unknown agent that is not
+        banned, StorageError.
         """
         with self._changing:
-            voxels = self.store.totals(agent_id).voxels
             self.members.require_evictable(agent_id, ban)
+        # first, so that none is left if the server ends in between
+        self._drop_refined(agent_id)
+        with self._changing:
+            voxels = self.store.totals(agent_id).voxels
             if is_former(agent_id):
                 self._release(agent_id)
             else:

@@ -122,7 +122,7 @@ class FrameAlignment:
 
     def is_placed_as(self, other: FrameAlignment) -> bool:
         """Return whether the vote reads the agent's updates in the same way with the other alignment."""
-        own, theirs = ((Segment(0, each.declared), *each.segments) for each in (self, other))
+        own, theirs = ((Segment(0, placed.declared), *placed.segments) for placed in (self, other))
         return (
             self.is_used == other.is_used
             and len(own) == len(theirs)
@@ -155,6 +155,12 @@ class FrameAlignment:
         is_kept = against if is_quarantined else segments
         state, message = (self.state, self.message) if is_kept else (AlignmentState.UNKNOWN, "")
         return replace(self, segments=segments, against=against, fit=None, state=state, message=message)
+
+    def renamed(self, agent_id: str, former: str) -> FrameAlignment:
+        """Return the alignment with what was measured against an agent's map under that map's new name."""
+        names = {agent_id: former}
+        segments = tuple(own._replace(witnesses=tuple(names.get(w, w) for w in own.witnesses)) for own in self.segments)
+        return replace(self, segments=segments, against=tuple(names.get(name, name) for name in self.against))
 
     @property
     def rank(self) -> tuple[bool, int]:
@@ -211,8 +217,14 @@ class FrameAlignments:
         self._next_id += 1
 
     def begin_map(self, agent_id: str, former: str) -> None:
-        """Let the agent's alignment stay with its former map; the store has moved its record."""
+        """Let the agent's alignment stay with its former map, as a witness too; the store has moved its record.
+
+        Raises StorageError.
+        """
         self._frames = {former if name == agent_id else name: own for name, own in self._frames.items()}
+        for name, (frame_id, own) in self._frames.items():
+            if agent_id in own.against or any(agent_id in segment.witnesses for segment in own.segments):
+                self._save(name, frame_id, own.renamed(agent_id, former))
         self._contributors = {former if name == agent_id else name for name in self._contributors}
         self.unmoved = frozenset(former if name == agent_id else name for name in self.unmoved)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from gausslite.codec.encoded_voxels import from_records, to_records
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, MismatchError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import (
     VoxelBatch,
@@ -37,33 +39,37 @@ from gausslite.fusion.vote import VoteResult, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
 
 # no agent can have an empty id
-_OWNER, RECORD = "", "refined-map"
+REFINEMENT = "", "refined-map"
+"""Owner and name of the stored refinement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedMap:
-    """The result of a refinement and the fused revision it started from."""
+    """The result of a refinement, the fused revision it started from, and the agents whose keyframes shaped it."""
 
     batch: VoxelBatch
     revision: int
+    sources: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredRefinement:
     """A refined map without the voxels that have changed, and a hash of the vote's winner in every unchanged voxel.
 
-    After a restart, the hashes tell which voxels have changed since. voted_keys are ascending.
+    After a restart, the hashes tell which voxels have changed since. voted_keys are ascending. sources: the agents
+    whose keyframes shaped it.
     """
 
     batch: VoxelBatch
     voted_keys: Int64[ndarray, " v"]
     winner_hashes: UInt64[ndarray, " v"]
+    sources: tuple[str, ...]
 
     def without(self, changed: Int64[ndarray, " c"]) -> StoredRefinement:
         """Return the refinement without these voxels, which changed since it started."""
         unchanged = ~np.isin(self.voted_keys, changed)
         batch = select_voxels(self.batch, ~np.isin(self.batch.keys, changed))
-        return StoredRefinement(batch, self.voted_keys[unchanged], self.winner_hashes[unchanged])
+        return StoredRefinement(batch, self.voted_keys[unchanged], self.winner_hashes[unchanged], self.sources)
 
     def changed_voxels(self, vote: VoteResult) -> Int64[ndarray, " c"]:
         """Return the voxels of the vote that have another winner, or another update of it, than in the refinement."""
@@ -88,20 +94,23 @@ def save_refinement(store: FusionStore, stored: StoredRefinement) -> None:
         "records": np.frombuffer(to_records(batch.gaussians).tobytes(), np.uint8),
         "voted_keys": stored.voted_keys,
         "winner_hashes": stored.winner_hashes,
+        "sources": np.frombuffer(json.dumps(stored.sources).encode(), np.uint8),
     }
-    store.save_record(_OWNER, RECORD, save({name: np.ascontiguousarray(column) for name, column in columns.items()}))
+    store.save_record(*REFINEMENT, save({name: np.ascontiguousarray(column) for name, column in columns.items()}))
 
 
 def load_refinement(store: FusionStore) -> StoredRefinement | None:
     """Return the store's refinement, None without one. Raises CodecError, StorageError."""
-    data = store.records(RECORD).get(_OWNER)
-    if data is None:
+    data = store.find_record(*REFINEMENT)
+    if not data:
         return None
     try:
         columns = load(data)
         gaussians = from_records(columns["records"].tobytes())
         batch = VoxelBatch(columns["keys"], columns["kappa_sums"], columns["counts"], gaussians)
-        return StoredRefinement(batch, columns["voted_keys"], columns["winner_hashes"])
+        # one that an earlier version stored may be of any agent's keyframes
+        sources = tuple(map(str, json.loads(columns["sources"].tobytes()))) if "sources" in columns else ()
+        return StoredRefinement(batch, columns["voted_keys"], columns["winner_hashes"], sources)
     except (SafetensorError, KeyError, ValueError, GaussLiteError) as error:
         raise CodecError(f"stored refinement: expected its arrays, got other bytes ({error})") from error
 
@@ -252,7 +261,7 @@ class FusedMapLayers:
             return
         vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
         fused_changes = self._change_log.record(changed_keys, vote)
-        if self._refined is not None:
+        if self._refined_log is not self._voted_log:
             is_present = np.isin(fused_changes, vote.keys)
             was_present = self._refined_log.find(fused_changes)["revisions"] > 0
             self._refined_log.record(fused_changes[is_present], fused_changes[~is_present & was_present])
@@ -273,6 +282,17 @@ class FusedMapLayers:
         tiles = self._read_tiles(MapLayer.VOTE)
         return merge_batches(*(won.of(only_agent) if only_agent else won.batch for won in tiles))
 
+    def voted_regions(self) -> tuple[VoxelBatch, dict[str, Int64[ndarray, " k"]]]:
+        """Return the fused map, and of each agent with voxels in it those that show a target of its task."""
+        tiles = list(self._read_tiles(MapLayer.VOTE))
+        batch = merge_batches(*(won.batch for won in tiles))
+        of_targets = np.repeat(batch.keys, batch.counts)[batch.gaussians.target != NO_TARGET]
+        winners = {name for won in tiles for name in won.keys_by_winner}
+        won_keys = {
+            name: [key for won in tiles for key in won.keys_by_winner.get(name, ())] for name in sorted(winners)
+        }
+        return batch, {name: np.intersect1d(np.array(own, np.int64), of_targets) for name, own in won_keys.items()}
+
     def union_map(self, only_agent: str = "") -> VoxelBatch:
         """Return all agents' Gaussians, or one agent's."""
         batches = self._votes.batches()
@@ -281,20 +301,20 @@ class FusedMapLayers:
             batches = {only_agent: batches[only_agent]}
         return union_maps(batches)
 
-    def show_refined(self, gaussians: Gaussians, revision: int) -> StoredRefinement:
+    def show_refined(self, gaussians: Gaussians, revision: int, sources: tuple[str, ...]) -> StoredRefinement:
         """Show the result of a refinement that started from the vote at this revision, one tile after the other.
 
-        Returns it for the store, with voxels that have changed since. Raises RevisionGoneError if the change log no
-        longer reaches back.
+        sources: the agents whose keyframes shaped it, empty if any may have. Returns it for the store, with voxels that
+        have changed since. Raises RevisionGoneError if the change log no longer reaches back.
         """
-        refined = RefinedMap(group_by_voxel(gaussians, self._grid), revision)
+        refined = RefinedMap(group_by_voxel(gaussians, self._grid), revision, sources)
         own: dict[int, set[int]] = {}
         for key, tile in zip(refined.batch.keys.tolist(), tiles_of(refined.batch.keys).tolist(), strict=True):
             own.setdefault(tile, set()).add(key)
         with self._lock:
             revisions = self._voted_log
             changed = set(revisions.changed_since(revision).tolist())
-            if self._refined is None:
+            if self._refined_log is self._voted_log:
                 self._refined_log = self._voted_log.copy()
             self._refined, seen = refined, revisions.revision
             known = {*self._refined_log.tiles().tolist(), *self._voted_log.tiles().tolist()}
@@ -309,7 +329,20 @@ class FusedMapLayers:
             hashes.append(_winner_hashes(vote))
         voted = np.concatenate(keys)
         order = np.argsort(voted)
-        return StoredRefinement(refined.batch, voted[order], np.concatenate(hashes)[order])
+        return StoredRefinement(refined.batch, voted[order], np.concatenate(hashes)[order], sources)
+
+    def is_refined_by(self, agent_id: str) -> bool:
+        """Return whether the agent's keyframes shaped the refined map, or may have."""
+        return self._refined is not None and agent_id in (self._refined.sources or (agent_id,))
+
+    def drop_refined(self) -> None:
+        """Show the vote in the refined layer, one tile after the other."""
+        with self._lock:
+            self._refined = None
+            tiles = {*self._refined_log.tiles().tolist(), *self._voted_log.tiles().tolist()}
+        for tile in sorted(tiles):
+            with self._lock:
+                self._show_tile(tile, set(self._voted_log.keys(tile).tolist()), set())
 
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels of the vote that changed or became empty after this revision. Raises RevisionGoneError."""
@@ -361,7 +394,7 @@ class FusedMapLayers:
     def _restore_refined(self, stored: StoredRefinement, vote: VoteResult) -> Int64[ndarray, " k"]:
         """Show a refinement from before a restart; returns the voxels of the refined layer."""
         changed = stored.changed_voxels(vote)
-        self._refined = RefinedMap(stored.without_removed(vote), self._voted_log.revision)
+        self._refined = RefinedMap(stored.without_removed(vote), self._voted_log.revision, stored.sources)
         # a later revision than the refinement's: these voxels show the vote
         self._voted_log.touch(changed)
         return np.union1d(self._refined.batch.keys, changed)

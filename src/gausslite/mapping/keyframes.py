@@ -210,11 +210,8 @@ class WindowView:
 
 def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
     """Prepare a keyframe for training. The margin gives the SSIM window its neighbours at the ROI's border."""
-    frame, relevance = keyframe.frame, keyframe.relevance
-    tiles, pixel_weights = tiles_touching(relevance.roi, _ROI_MARGIN_PX), relevance.pixel_weights
-    if settings.roi_context_weight > 0:
-        context = np.float32(settings.roi_context_weight) * _pixels_inside(tiles, pixel_weights.shape)
-        pixel_weights = np.maximum(pixel_weights, context)
+    frame = keyframe.frame
+    tiles, pixel_weights = roi_weights(keyframe.relevance.pixel_weights, settings.roi_context_weight)
     depth_m = without_depth_edges(frame.depth_m, settings.depth_edge_px)
     return WindowView(
         keyframe=keyframe,
@@ -235,6 +232,17 @@ def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Raste
     halved_m = np.where(measured > _ALL_MEASURED, halved_m, np.float32(0.0))
     camera = frame.camera.resized(width, height)
     return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, _HALF_SIZE_DILATION_PX2)
+
+
+def roi_weights(
+    pixel_weights: Float32[ndarray, "h w"], context_weight: float
+) -> tuple[Bool[ndarray, "th tw"], Float32[ndarray, "h w"]]:
+    """Return the tiles of the pixels with a weight, and the weights with those of the other pixels inside the tiles."""
+    tiles = tiles_touching(pixel_weights > 0, _ROI_MARGIN_PX)
+    if context_weight > 0:
+        context = np.float32(context_weight) * _pixels_inside(tiles, pixel_weights.shape)
+        pixel_weights = np.maximum(pixel_weights, context)
+    return tiles, pixel_weights
 
 
 def tiles_touching(mask: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th tw"]:

@@ -160,7 +160,7 @@ class KeyframeSettings:
         )
 
 
-_BALANCED_LOSS = LossWeights(normalise_by_image=True)
+BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ class OptimizationSettings:
     active_iterations: int = 6
     active_views: int = 8
     active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
-    loss: LossWeights = _BALANCED_LOSS
+    loss: LossWeights = BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES
     isotropic: bool = False
     ema_updates: float = 32.0

@@ -686,7 +686,7 @@ class RefineFusedMapRequest(_message.Message):
     SEED_FIELD_NUMBER: _builtins.int
     mission_id: _builtins.str
     iterations: _builtins.int
-    """0 = the server's default."""
+    """At most; it ends when held-out keyframes stop improving. 0 = the server's default."""
     max_gaussians: _builtins.int
     seed: _builtins.int
     def __init__(
@@ -714,12 +714,17 @@ class RefineFusedMapResponse(_message.Message):
     LOSS_FIELD_NUMBER: _builtins.int
     GAUSSIANS_FIELD_NUMBER: _builtins.int
     DONE_FIELD_NUMBER: _builtins.int
+    LEFT_OUT_FIELD_NUMBER: _builtins.int
     iteration: _builtins.int
     iterations: _builtins.int
     loss: _builtins.float
     gaussians: _builtins.int
     done: _builtins.bool
     """True once, at the end: the refined map can be exported."""
+    @_builtins.property
+    def left_out(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Agents of which keyframes disagree with the vote and are left out, as "NAME: 3 of 40 keyframes"."""
+
     def __init__(
         self,
         *,
@@ -728,10 +733,11 @@ class RefineFusedMapResponse(_message.Message):
         loss: _builtins.float = ...,
         gaussians: _builtins.int = ...,
         done: _builtins.bool = ...,
+        left_out: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["done", b"done", "gaussians", b"gaussians", "iteration", b"iteration", "iterations", b"iterations", "loss", b"loss"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["done", b"done", "gaussians", b"gaussians", "iteration", b"iteration", "iterations", b"iterations", "left_out", b"left_out", "loss", b"loss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

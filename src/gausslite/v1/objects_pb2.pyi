@@ -62,7 +62,9 @@ class ObjectLandmark(_message.Message):
     LAST_SEEN_NS_FIELD_NUMBER: _builtins.int
     OBSERVERS_FIELD_NUMBER: _builtins.int
     id: _builtins.str
-    """Unique among the objects of one agent or, from the fusion server, of the team: AGENT/ID of the earliest observer."""
+    """Unique among the objects of one agent or, from the fusion server, of the team: team/NOUN-NUMBER, which it
+    keeps while agents join or leave its observers.
+    """
     noun: _builtins.str
     """A noun phrase of the task."""
     role: Global___ObjectRole.ValueType

@@ -12,6 +12,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
 from gausslite.fusion.refinement import Refinement, RefineSettings
+from gausslite.fusion.refinement_views import RefineInput
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.choose import choose_rasterizer
@@ -102,7 +103,9 @@ def _fuse(trial: TeamTrial, maps: Sequence[AgentMap]) -> tuple[dict[str, Gaussia
         keyframes = engine.in_fused_frame([keyframe for agent_map in maps for keyframe in agent_map.keyframes])
         settings = RefineSettings(iterations=trial.refine_iterations, seed=trial.settings.seed)
         rasterizer = choose_rasterizer(threads=trial.settings.threads)
-        refinement = Refinement(fused[VOTE], keyframes, rasterizer, settings)
+        voted, regions = engine.maps.voted_regions()
+        vote = RefineInput(voted.gaussians, keyframes, regions, _GRID, engine.maps.revision())
+        refinement = Refinement(vote, rasterizer, settings)
         for _ in refinement.steps():
             pass
         fused[REFINED] = refinement.result()

@@ -68,14 +68,14 @@ def _parts(rng: np.random.Generator, T_agent_fused: Float64[ndarray, "4 4"]) -> 
     rows = _room()[chosen]
     n = len(rows)
     whole = Gaussians(
-        (rows[:, MEAN] + rng.normal(0, _NOISE_M, (n, 3))).astype(np.float32),
-        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        np.full((n, 3), 0.03, np.float32),
-        np.full(n, 0.9, np.float32),
-        (rows[:, RGB] * rng.uniform(0.9, 1.1) + rng.normal(0, 0.02, (n, 3))).astype(np.float32),
-        np.ones(n, np.bool_),
-        rng.integers(1, 9, n).astype(np.uint32),
-        np.zeros(n, np.int16),
+        means_m=(rows[:, MEAN] + rng.normal(0, _NOISE_M, (n, 3))).astype(np.float32),
+        quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        scales_m=np.full((n, 3), 0.03, np.float32),
+        opacities=np.full(n, 0.9, np.float32),
+        rgb=(rows[:, RGB] * rng.uniform(0.9, 1.1) + rng.normal(0, 0.02, (n, 3))).astype(np.float32),
+        active=np.ones(n, np.bool_),
+        kappa=rng.integers(1, 9, n).astype(np.uint32),
+        target=np.zeros(n, np.int16),
     )
     seen = np.linspace(0, SEED_VIEWS, _PARTS + 1)[1:]
     return [move_gaussians(whole.take(np.flatnonzero(view < views)), T_agent_fused) for views in seen]

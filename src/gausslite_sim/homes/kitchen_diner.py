@@ -65,7 +65,7 @@ def furnish(rng: np.random.Generator) -> list[Item]:
     room = Room(5.4, 4.4, 2.6, rng)
     room.place_at_wall("fridge", furniture.cupboard((0.66, 0.64, 1.8), "fridge_front", "white_plastic"), "north", 0.36)
     room.place_at_wall(
-        "oven", furniture.cupboard((0.6, 0.6, 0.9), "oven_front", "steel", 1, "black_glass"), "north", 2.95
+        "oven", furniture.cupboard((0.6, 0.6, 0.9), "oven_front", "steel", 1, "black_glass"), "north", 2.98
     )
     room.place_at_wall(
         "counter", furniture.cupboard((1.95, 0.6, 0.9), "doors", "light_wood", 3, "marble"), "north", 1.68

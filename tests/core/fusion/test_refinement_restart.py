@@ -17,6 +17,7 @@ from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import VoxelBatch, select_voxels
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
+from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.score_index import VoxelScoreTable
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -37,7 +38,7 @@ def shown(engine: FusionEngine) -> Shown:
     """Return what watchers of the refined layer see: means and colours by voxel."""
     changes = engine.maps.changes(0, MapLayer.REFINED)
     batch = changes.won.batch
-    exported = engine.maps.refined_map()
+    exported = engine.maps.refined_map() if engine.maps.is_refined else engine.maps.voted_map()
     assert exported.gaussians.means_m.tobytes() == batch.gaussians.means_m.tobytes()
     assert exported.gaussians.rgb.tobytes() == batch.gaussians.rgb.tobytes()
     return {
@@ -59,6 +60,7 @@ def test_the_refined_map_is_the_same_after_a_restart_at_every_step(tmp_path: Pat
     engine.contribute(bee, make_subset("bee", 1, {cell: [2] for cell in range(5)}), GRID)
     with pytest.raises(MismatchError, match="expected a refinement first"):
         engine.maps.refined_map()
+    engine.keyframes.add(EncodedKeyframe("ant", 1, 1, 1, b"keyframe"))
     revision = engine.maps.revision()
     voted = engine.maps.voted_map().gaussians
     # changes during the refinement: a newer update, a new voxel, a removed one
@@ -66,7 +68,7 @@ def test_the_refined_map_is_the_same_after_a_restart_at_every_step(tmp_path: Pat
     # the refinement moved the Gaussians of the last voxel into one of nobody
     moved = red(voted)
     moved.means_m[-3:] += np.array([5.0, 0, 0], np.float32)
-    engine.store_refined(moved, revision)
+    engine.store_refined(moved, revision, ("ant",))
     before = shown(engine)
     engine = restart(engine, path)
     assert engine.status().refined
@@ -136,7 +138,7 @@ def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_an
 
     sender = threading.Thread(target=send)
     store.during = sender.start
-    engine.store_refined(refined, revision)
+    engine.store_refined(refined, revision, ())
     sender.join()
     # each cube of 16 voxels alone
     assert 0 < store.largest_read <= 32
@@ -146,6 +148,33 @@ def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_an
     assert before.keys() - red_voxels == set(keys(3, 40, 150, 180).tolist())
     engine = restart(engine, path)
     assert shown(engine) == before
+    engine.store.close()
+
+
+@pytest.mark.parametrize("evicted", ["cat", "bee"])
+def test_evicting_an_agent_undoes_the_refinement_that_its_keyframes_shaped(tmp_path: Path, evicted: str) -> None:
+    path = tmp_path / "store.sqlite"
+    engine = open_engine(path)
+    ant, _, cat = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee", "cat"))
+    engine.contribute(ant, make_subset("ant", 1, {cell: [5] * 3 for cell in range(10)}), GRID)
+    for name, session in (("ant", ant), ("cat", cat)):
+        engine.keyframes.add(EncodedKeyframe(name, 1, 1, 1, b"keyframe"), session_id=session)
+    voted, revision = shown(engine), engine.maps.revision()
+    engine.store_refined(red(engine.maps.voted_map().gaussians), revision, ("ant", "cat"))
+    refined, since = shown(engine), engine.maps.revision(MapLayer.REFINED)
+    engine.evict(evicted, ban=True)
+    expected = voted if evicted == "cat" else refined
+    assert shown(engine) == expected != (refined if evicted == "cat" else voted)
+    # watchers of the layer see the vote again
+    changed = engine.maps.changes(since, MapLayer.REFINED).won.batch
+    assert len(changed) == (10 if evicted == "cat" else 0)
+    engine = restart(engine, path)
+    assert shown(engine) == expected
+    assert engine.status().refined == (evicted == "bee")
+    # one that ran meanwhile is not stored
+    with pytest.raises(MismatchError, match="the keyframes of dog to stay"):
+        engine.store_refined(red(engine.maps.voted_map().gaussians), engine.maps.revision(), ("ant", "dog"))
+    assert shown(engine) == voted
     engine.store.close()
 
 

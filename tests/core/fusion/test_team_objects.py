@@ -47,11 +47,10 @@ def test_two_observations_of_one_object_are_merged_with_both_observers() -> None
         "bee": report(near, landmark("table", (1, 0.5, 0), half_m=0.4)),
     }
     mug, table = sorted(merge_objects(reports), key=lambda found: found.landmark.noun)
-    assert mug.landmark.object_id == "ant/mug-1"
-    assert mug.landmark.confidence == pytest.approx(1 - 0.5 * 0.2)
-    assert mug.landmark.centroid_m[0] == pytest.approx((0.5 * 1 + 0.8 * 1.06) / 1.3)
-    assert mug.landmark.extent_m.min_m[0] == pytest.approx(0.95)
-    assert mug.landmark.extent_m.max_m[0] == pytest.approx(1.11)
+    assert mug.landmark.confidence == pytest.approx(1 - 0.35**2)
+    assert mug.landmark.centroid_m[0] == pytest.approx(1.03)
+    assert mug.landmark.extent_m.min_m[0] == pytest.approx(0.98)
+    assert mug.landmark.extent_m.max_m[0] == pytest.approx(1.08)
     assert (mug.landmark.first_seen_ns, mug.landmark.last_seen_ns) == (10, 35)
     assert [(o.agent_id, o.object_id, o.target) for o in mug.observers] == [("ant", "mug-1", 0), ("bee", "mug-3", 0)]
     assert [(o.agent_id, o.target) for o in table.observers] == [("bee", -1)]
@@ -70,8 +69,54 @@ def test_each_object_merges_with_the_nearest_one() -> None:
         "ant": report(landmark("mug", (0, 0, 0), 1), landmark("mug", (0.12, 0, 0), 2)),
         "bee": report(landmark("mug", (0.10, 0, 0))),
     }
-    merged = {each.landmark.object_id: len(each.observers) for each in merge_objects(reports)}
-    assert merged == {"ant/mug-1": 1, "bee/mug-1": 2} or merged == {"ant/mug-1": 1, "ant/mug-2": 2}
+    observers = [[seen.object_id for seen in found.observers] for found in merge_objects(reports)]
+    assert sorted(observers) == [["mug-1"], ["mug-2", "mug-1"]]
+
+
+BAD_REPORTS = {
+    "a room around the mug": landmark("mug", (1, 0, 0), half_m=2.0, confidence=1.0),
+    "a mug beside the mug": replace(landmark("mug", (1.1, 0, 0), confidence=1.0), first_seen_ns=-1),
+    "a mug where the mug is": replace(landmark("mug", (1, 0, 0), confidence=1.0), first_seen_ns=-1),
+}
+
+
+@pytest.mark.parametrize("bad", BAD_REPORTS.values(), ids=BAD_REPORTS)
+@pytest.mark.parametrize("seed", range(3))
+def test_one_agent_neither_moves_widens_nor_renames_what_others_see(bad: ObjectLandmark, seed: int) -> None:
+    rng, objects = np.random.default_rng(seed), MergedObjects(SqliteStore())
+    centres = [(float(x), float(y), 0.0) for x, y in rng.normal((1.0, 0.0), 0.01, (3, 2))]
+    good = {name: report(landmark("mug", centre)) for name, centre in zip("abc", centres, strict=True)}
+    [before] = objects.of(good, {})
+    repeated = replace(bad, object_id="again")
+    after = objects.of({**good, "aardvark": report(bad, repeated)}, {})
+    mug = next(found.landmark for found in after if found.landmark.object_id == before.landmark.object_id)
+    assert {seen.agent_id for found in after if found.landmark == mug for seen in found.observers} >= {*"abc"}
+    assert np.ptp([mug.centroid_m, before.landmark.centroid_m], axis=0).max() < 0.03
+    assert max(mug.size_m) < 0.15
+    # after the bad agent is evicted, the object is as before
+    assert objects.of(good, {}) == (before,)
+
+
+def test_a_mug_between_two_mugs_does_not_make_them_one() -> None:
+    reports = {name: report(landmark("mug", (x, 0, 0))) for name, x in (("ant", 0), ("bee", 0.2), ("cat", 0.1))}
+    assert len(merge_objects(reports)) == 2
+
+
+def test_an_object_keeps_its_id_when_agents_join_and_leave_and_after_a_restart() -> None:
+    store = SqliteStore()
+    reports = {"ant": report(landmark("mug", (1, 0, 0)), landmark("mug", (3, 0, 0), 2))}
+    first, second = sorted(found.landmark.object_id for found in MergedObjects(store).of(reports, {}))
+    assert (first, second) == ("team/mug-1", "team/mug-2")
+    seen_by_both = {**reports, "aardvark": report(landmark("mug", (1, 0, 0.02), 7))}
+    for later in (seen_by_both, {"aardvark": seen_by_both["aardvark"]}):
+        found = {found.landmark.object_id: found.observers for found in MergedObjects(store).of(later, {})}
+        assert found["team/mug-1"][0].object_id == "mug-7"
+    # a new object has a new id
+    [other] = MergedObjects(store).of({"ant": report(landmark("mug", (9, 0, 0)))}, {})
+    assert other.landmark.object_id == "team/mug-3"
+    store.save_record("", "object-ids", b"[1")
+    with pytest.raises(CodecError, match="stored ids of objects"):
+        MergedObjects(store)
 
 
 def merge_all_pairs(reports: dict[str, ObjectReport]) -> set[frozenset[tuple[str, str]]]:
@@ -80,27 +125,35 @@ def merge_all_pairs(reports: dict[str, ObjectReport]) -> set[frozenset[tuple[str
         ((owner, mark) for owner, own in reports.items() for mark in own.objects),
         key=lambda member: (member[1].first_seen_ns, member[0], member[1].object_id),
     )
-    pairs = []
+    centres = np.array([mark.centroid_m for _, mark in landmarks])
+    diagonals = [float(np.linalg.norm(mark.size_m)) for _, mark in landmarks]
+    pairs, repeated = [], set()
     for (i, (owner, first)), (j, (other, second)) in itertools.combinations(enumerate(landmarks), 2):
-        boxes = [(np.array(mark.extent_m.min_m), np.array(mark.extent_m.max_m)) for mark in (first, second)]
-        (low, high), (low2, high2) = boxes
-        distance = float(np.linalg.norm(np.array(first.centroid_m) - np.array(second.centroid_m)))
-        diagonal = min(float(np.linalg.norm(box[1] - box[0])) for box in boxes)
-        shared = np.prod(np.maximum(np.minimum(high, high2) - np.maximum(low, low2), 0.0))
-        smaller = min(float(np.prod(box[1] - box[0])) for box in boxes)
-        overlaps = smaller > 0 and shared >= 0.3 * smaller
-        if owner != other and first.noun == second.noun and (distance < max(0.15, 0.5 * diagonal) or overlaps):
-            pairs.append((distance, j, i))
-    clusters = [{(owner, mark.object_id)} for owner, mark in landmarks]
-    for _, i, j in sorted(pairs):
-        a, b = (
-            next(cluster for cluster in clusters if (landmarks[k][0], landmarks[k][1].object_id) in cluster)
-            for k in (i, j)
+        (low, high), (low2, high2) = (
+            (np.array(mark.extent_m.min_m), np.array(mark.extent_m.max_m)) for mark in (first, second)
         )
-        if a is not b and not {owner for owner, _ in a} & {owner for owner, _ in b}:
+        shared = np.prod(np.maximum(np.minimum(high, high2) - np.maximum(low, low2), 0.0))
+        larger = max(float(np.prod(high - low)), float(np.prod(high2 - low2)))
+        alike = max(diagonals[i], diagonals[j]) <= 2.5 * min(diagonals[i], diagonals[j]) + 0.15
+        overlaps = larger > 0 and shared >= 0.3 * larger
+        distance = float(np.linalg.norm(centres[i] - centres[j]))
+        near = distance < max(0.15, 0.5 * min(diagonals[i], diagonals[j]))
+        if first.noun == second.noun and alike and (near or overlaps) and owner != other:
+            pairs.append((distance, j, i))
+        if first.noun == second.noun and alike and overlaps and owner == other:
+            repeated.add(j)
+    clusters = [[i] for i in range(len(landmarks))]
+    reaches = {i: max(0.15, 0.5 * diagonal) for i, diagonal in enumerate(diagonals)}
+    for _, i, j in sorted(pairs):
+        a, b = (next(cluster for cluster in clusters if k in cluster) for k in (i, j))
+        apart = np.linalg.norm(np.median(centres[a], axis=0) - np.median(centres[b], axis=0))
+        if a is b or {i, j} & repeated or {landmarks[k][0] for k in a} & {landmarks[k][0] for k in b}:
+            continue
+        if len(a) + len(b) == 2 or apart < max(reaches[a[0]], reaches[b[0]]):
             clusters.remove(b)
-            a |= b
-    return {frozenset(cluster) for cluster in clusters}
+            a += b
+            reaches[a[0]] = float(np.median([reaches[a[0]], reaches[b[0]]]))
+    return {frozenset((landmarks[k][0], landmarks[k][1].object_id) for k in cluster) for cluster in clusters}
 
 
 @pytest.mark.parametrize("largest_group", [4, 64])
@@ -135,7 +188,7 @@ def test_the_number_of_comparisons_is_bounded_however_many_landmarks_there_are(s
 
 
 def test_objects_are_merged_once_until_a_report_or_a_frame_changes() -> None:
-    reports, merged = {"ant": report(landmark("mug", (1, 0, 0)))}, MergedObjects()
+    reports, merged = {"ant": report(landmark("mug", (1, 0, 0)))}, MergedObjects(SqliteStore())
     with patch("gausslite.fusion.objects.merge_objects", wraps=merge_objects) as merging:
         first = merged.of(reports, {})
         assert merged.of(dict(reports), {}) is first

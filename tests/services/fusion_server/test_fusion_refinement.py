@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset, photograph
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from gausslite.codec.ply import gaussians_from_ply
@@ -18,6 +18,8 @@ from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
+
+CELLS = {cell: [3] * 4 for cell in (-1, 0, 1)}
 
 
 def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
@@ -39,8 +41,10 @@ def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
 
 def contributed(t: RunningServer) -> str:
     session = t.client.join("ant", GRID).session_id
-    t.contribute_subsets(session, make_subset("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
-    t.client.contribute_keyframes(session, [frame(1), frame(2)])
+    t.contribute_subsets(session, make_subset("ant", 1, CELLS))
+    t.client.contribute_keyframes(session, [photograph(1, CELLS), photograph(2, CELLS)])
+    # of an agent without a voxel, as a wrong pose would show
+    t.client.contribute_keyframes(t.client.join("bee", GRID).session_id, [frame(1)])
     return session
 
 
@@ -52,6 +56,7 @@ def test_refinement_reports_progress_and_its_map_shows_newer_votes() -> None:
         progress = list(t.client.refine(iterations=4))
         assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
         assert progress[-1].iteration == progress[-1].iterations == 4
+        assert progress[-1].left_out == ["bee: 1 of 1 keyframes"]
         assert t.client.status().refined
         refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
         assert refined.rgb.tobytes() != voted.rgb.tobytes()
@@ -89,7 +94,7 @@ def test_a_refinement_without_useful_keyframes_is_refused() -> None:
             list(t.client.refine())
         behind = np.diag([1.0, -1.0, -1.0, 1.0])
         t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
-        with pytest.raises(InvalidInputError, match="but none does"):
+        with pytest.raises(InvalidInputError, match="got 1: 0 show it"):
             list(t.client.refine())
 
 

@@ -9,7 +9,7 @@ from unittest.mock import patch
 import grpc
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
+from fusion_running import CAMERA, GRID, fusion_server, make_subset, photograph
 from sample_gaussians import textured_corner
 from torch_oracle.rasterizer import ReferenceRasterizer
 from waiting import wait_until
@@ -96,7 +96,7 @@ def test_watchers_follow_the_refined_layer() -> None:
     with fusion_server() as server:
         session = server.client.join("ant", GRID).session_id
         server.contribute_subsets(session, make_subset("ant", 1, CELLS))
-        server.client.contribute_keyframes(session, [frame(0), frame(1)])
+        server.client.contribute_keyframes(session, [photograph(0, CELLS), photograph(1, CELLS)])
         watched = empty_batch()
         updates = server.client.watch(layer="refined")
         watched = next(updates).apply_to(watched)
