@@ -17,7 +17,7 @@ from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.pose import inverse
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.scene import HomeScene
-from gausslite_sim.view import View, render_view
+from gausslite_sim.view import PIXEL_RAYS_PX, View, render_view
 
 _SAMPLE_STEP_PX = 1.0
 """Image motion between two samples of one exposure, at a distance of _NEAR_M: one pixel leaves no ghosts."""
@@ -53,10 +53,10 @@ def render_recorded_view(scene: HomeScene, camera: RecordingCamera, poses_at: Po
     """
     row_times_s, samples = camera.row_times_s(), _exposure_samples(camera, poses_at)
     shares = (np.arange(samples) + 0.5) / samples - 0.5
-    views = [
-        render_view(scene, RayCamera(camera.camera, poses_at(row_times_s + share * camera.exposure_s), camera.lens))
-        for share in shares
-    ]
+    cameras = (
+        RayCamera(camera.camera, poses_at(row_times_s + share * camera.exposure_s), camera.lens) for share in shares
+    )
+    views = [render_view(scene, ray_camera, PIXEL_RAYS_PX[i::samples]) for i, ray_camera in enumerate(cameras)]
     rgb: Float32[ndarray, "h w 3"] = np.stack([view.rgb for view in views]).mean(axis=0, dtype=np.float32)
     return replace(views[samples // 2], rgb=rgb)
 

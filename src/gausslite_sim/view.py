@@ -17,18 +17,17 @@ from gausslite_sim.textures import SIDE_PX
 _UV_TOLERANCE = 0.15
 """Greatest error of a predicted texture coordinate, as a share of the pixel's footprint."""
 _LIGHT_TOLERANCE = 0.06
-"""Greatest difference of the light in a pixel's centre and corners, about 1 under a lamp."""
+"""Greatest difference of the light in a pixel's centre and at its border, about 1 under a lamp."""
 _REFLECTION_TOLERANCE = 6.0
 """Greatest difference of the reflections in two neighbouring pixels, of 255."""
-_SPREAD = 24.0
-"""Standard deviation of the first rays' colours, of 255, from which a pixel gets all of them."""
+_SPREAD = 32.0
+"""Standard deviation of the first rays' colours, of 255, from which a pixel gets all rays."""
 _TAPS = 6
 """Texture look-ups along the shorter side of a pixel without an edge."""
-_FEW, _MANY = 16, 64
-"""Rays of a pixel with an edge, and of one where the colours of the first ones differ."""
-_ORDER = np.argsort(np.arange(_MANY) % 4 != 2, kind="stable")
-PIXEL_RAYS_PX = ((np.stack([_ORDER, 19 * _ORDER % _MANY], axis=1) + 0.5) / _MANY - 0.5).astype(np.float32)
-"""Offsets of rays from a pixel's centre: a lattice of _MANY; the first _FEW of them are a lattice too."""
+_RAYS = 64
+_ORDER = np.argsort(np.arange(_RAYS) % 2 == 0, kind="stable")
+PIXEL_RAYS_PX = ((np.stack([_ORDER, 19 * _ORDER % _RAYS], axis=1) + 0.5) / _RAYS - 0.5).astype(np.float32)
+"""Offsets of rays from the centre of a pixel with an edge: a lattice; the first half of them is a lattice too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +44,11 @@ class View:
     gloss: Float32[ndarray, "h w"]
 
 
-def render_view(scene: HomeScene, camera: RayCamera) -> View:
-    """Return one view; depth is that of the ray through the pixel's centre, along the optical axis of its row."""
+def render_view(scene: HomeScene, camera: RayCamera, rays_px: Float32[ndarray, "k 2"] = PIXEL_RAYS_PX) -> View:
+    """Return one view; depth is that of the ray through the pixel's centre, along the optical axis of its row.
+
+    rays_px: a part of PIXEL_RAYS_PX, if the mean of views from nearby poses is wanted.
+    """
     shape, pixels = camera.shape, camera.pixels()
     columns, rows = camera.centres(pixels)
     rays = camera.rays(pixels, columns, rows)
@@ -63,7 +65,7 @@ def render_view(scene: HomeScene, camera: RayCamera) -> View:
     uneven = _edges(scene, camera, hits, surface, steps)
     uneven |= _steps_between((rgb - matt * (1 - HEAD_ON * gloss[:, None])).reshape(*shape, 3)).ravel()
     edge = np.flatnonzero(uneven)
-    rgb[edge] = _ray_means(scene, camera, edge)
+    rgb[edge] = _ray_means(scene, camera, edge, rays_px)
     images = (np.where(is_hit, hits.distance, np.float32(0)), item, surface.facing, gloss)
     return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in images))
 
@@ -86,23 +88,27 @@ def render_instances(
 def _edges(
     scene: HomeScene, camera: RayCamera, hits: Hits, surface: Surface, steps: Float32[ndarray, "2 n 2"]
 ) -> Bool[ndarray, " n"]:
-    """Return the pixels with a corner that shows another texture, or other coordinates or light than predicted."""
+    """Return the pixels where another texture shows, or other coordinates or light than predicted.
+
+    Their corners are looked at, and the middles of their upper and lower sides.
+    """
     table, (height, width) = scene.triangles, camera.shape
-    corner_row, corner_column = np.divmod(np.arange((height + 1) * (width + 1)), width + 1)
-    exposed = np.minimum(corner_row, height - 1) * width
-    rays = camera.rays(exposed, corner_column.astype(np.float32), corner_row.astype(np.float32))
-    corners = scene.cast(rays.origins_m, rays.directions)
+    probes = 2 * width + 1
+    probe_row, probe_column = np.divmod(np.arange((height + 1) * probes), probes)
+    exposed = np.minimum(probe_row, height - 1) * width
+    rays = camera.rays(exposed, probe_column.astype(np.float32) / 2, probe_row.astype(np.float32))
+    probed = scene.cast(rays.origins_m, rays.directions)
     footprint = np.maximum(np.abs(steps).max(axis=(0, 2)), np.float32(1 / SIDE_PX))
     row, column = np.divmod(camera.pixels(), width)
     edge = np.zeros(len(row), np.bool_)
-    for below, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        at = (row + below) * (width + 1) + column + right
+    for below, right in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)):
+        at = (row + below) * probes + 2 * column + right
         # within one triangle the prediction holds
-        other = np.flatnonzero(corners.triangle[at] != hits.triangle)
+        other = np.flatnonzero(probed.triangle[at] != hits.triangle)
         at = at[other]
-        found = Hits(corners.triangle[at], corners.barycentric[at], corners.distance[at])
+        found = Hits(probed.triangle[at], probed.barycentric[at], probed.distance[at])
         seen = Surface.of(scene, found, rays.directions[at])
-        predicted = surface.uv[other] + (right - 0.5) * steps[0][other] + (below - 0.5) * steps[1][other]
+        predicted = surface.uv[other] + (0.5 * right - 0.5) * steps[0][other] + (below - 0.5) * steps[1][other]
         error = seen.uv - predicted
         differs = np.abs(error - np.rint(error)).max(axis=1) > _UV_TOLERANCE * footprint[other]
         differs |= np.abs(seen.light - surface.light[other]).max(axis=1) > _LIGHT_TOLERANCE
@@ -122,14 +128,16 @@ def _steps_between(reflections: Float32[ndarray, "h w 3"]) -> Bool[ndarray, "h w
     return edge
 
 
-def _ray_means(scene: HomeScene, camera: RayCamera, pixels: Int64[ndarray, " n"]) -> Float32[ndarray, "n 3"]:
-    """Return the mean colours of few rays in each pixel, or of many where the colours of the few differ."""
-    few = _ray_colours(scene, camera, pixels, PIXEL_RAYS_PX[:_FEW])
-    sums = few.sum(axis=1)
-    means: Float32[ndarray, "n 3"] = sums / np.float32(_FEW)
+def _ray_means(
+    scene: HomeScene, camera: RayCamera, pixels: Int64[ndarray, " n"], rays_px: Float32[ndarray, "k 2"]
+) -> Float32[ndarray, "n 3"]:
+    """Return the mean colours of half of the rays in each pixel, or of all where the colours of the half differ."""
+    half = max(1, len(rays_px) // 2)
+    few = _ray_colours(scene, camera, pixels, rays_px[:half])
+    means: Float32[ndarray, "n 3"] = few.mean(axis=1)
     uneven = np.flatnonzero(few.std(axis=1).max(axis=1) > _SPREAD)
-    more = _ray_colours(scene, camera, pixels[uneven], PIXEL_RAYS_PX[_FEW:])
-    means[uneven] = (sums[uneven] + more.sum(axis=1)) / np.float32(_MANY)
+    more = _ray_colours(scene, camera, pixels[uneven], rays_px[half:])
+    means[uneven] = (few[uneven].sum(axis=1) + more.sum(axis=1)) / np.float32(len(rays_px))
     return means
 
 
@@ -144,7 +152,7 @@ def _ray_colours(
     hits = scene.cast(rays.origins_m, rays.directions)
     surface = Surface.of(scene, hits, rays.directions)
     # geometric mean of a ray's footprints across and along the slope
-    width_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(_MANY * np.maximum(surface.facing, 0.05))
+    width_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(_RAYS * np.maximum(surface.facing, 0.05))
     rgb = diffuse_colour(scene, hits, surface, width_m)
     add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
     return rgb.reshape(len(pixels), len(offsets), 3)
