@@ -16,7 +16,7 @@ from gausslite_sim.textures import SIDE_PX
 
 _UV_TOLERANCE = 0.15
 """Greatest error of a predicted texture coordinate, as a share of the pixel's footprint."""
-_LIGHT_TOLERANCE = 0.06
+_LIGHT_TOLERANCE = 0.05
 """Greatest difference of the light in a pixel's centre and at its border, about 1 under a lamp."""
 _REFLECTION_TOLERANCE = 6.0
 """Greatest difference of the reflections in two neighbouring pixels, of 255."""
