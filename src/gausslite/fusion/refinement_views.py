@@ -27,9 +27,9 @@ _FOOTPRINT_ALPHA = 0.5
 _DEPTH_M, _DEPTH_SHARE, _COLOUR = 0.05, 0.05, 0.1
 """Measured and rendered surface agree within this distance plus this share of the depth, and this mean difference of
 the channels. In the simulated home 84 to 98 % of a keyframe's pixels agree, 10 to 50 % with its pose 0.1 m off."""
-_MIN_AGREEMENT, _MIN_OF_BEST = 0.5, 0.75
-"""Least agreement where no agent of the vote has keyframes, and least share of the median of the one that agrees best:
-a coarse map agrees less with every keyframe."""
+_MIN_AGREEMENT, _MIN_ALONE, _MIN_OF_BEST = 0.05, 0.5, 0.75
+"""Least agreement; the same where no agent of the vote has keyframes; and least share of the median of the agent that
+agrees best, because a coarse map agrees less with every keyframe."""
 _UNEXPLAINED, BACKGROUND = -2, -1
 
 
@@ -117,9 +117,8 @@ def agreeing(views: Sequence[RefineView], contributors: Collection[str]) -> tupl
         by_agent.setdefault(view.agent_id, []).append(view.agreement)
     medians = {name: float(np.median(own)) for name, own in by_agent.items()}
     standard = [median for name, median in medians.items() if name in contributors]
-    least = _MIN_OF_BEST * max(standard or medians.values(), default=0.0)
-    if not standard:
-        least = max(_MIN_AGREEMENT, least)
+    best = max(standard or medians.values(), default=0.0)
+    least = max(_MIN_AGREEMENT if standard else _MIN_ALONE, _MIN_OF_BEST * best)
     left_out = Counter(view.agent_id for view in views if view.agreement < least)
     lines = (f"{name}: {count} of {len(by_agent[name])} keyframes" for name, count in sorted(left_out.items()))
     return [view for view in views if view.agreement >= least], tuple(lines)

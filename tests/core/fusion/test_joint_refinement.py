@@ -131,8 +131,9 @@ def test_keyframes_that_disagree_with_the_vote_are_left_out_by_name(wrong: Agent
     assert progress[-1].left_out == refinement.left_out == ("bee: 1 of 1 keyframes",)
     assert refinement.sources == ("ant",)
     assert refinement.result().rgb.tobytes() == refine(patch(0.2), good, rasterizer, QUICK)[0].rgb.tobytes()
-    with pytest.raises(InvalidInputError, match="1 show it, none as the vote does"):
-        refine(patch(0.2), [wrong], rasterizer, QUICK)
+    for alone in (wrong, dataclasses.replace(wrong, agent_id="ant")):
+        with pytest.raises(InvalidInputError, match="1 show it, none as the vote does"):
+            refine(patch(0.2), [alone], rasterizer, QUICK)
 
 
 def test_an_empty_or_too_large_map_is_refused() -> None:
