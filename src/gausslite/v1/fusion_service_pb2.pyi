@@ -174,8 +174,8 @@ class JoinSessionRequest(_message.Message):
     world_frame: _builtins.str
     """Name of the coordinate frame of all poses and means; empty accepts the server's."""
     fresh_map: _builtins.bool
-    """The agent begins a new map. Its earlier updates stay in the vote as agent_id + ":earlier", until the new map has
-    the higher sum of kappa in all their voxels. Its keyframes and objects are deleted.
+    """The agent begins a new map, in another epoch. Its former maps stay in the vote, each as agent_id + ":" + epoch, until
+    they win no voxel; at most seven. Its keyframes and objects are deleted.
     """
     token: _builtins.str
     """A secret of this robot, the same in all of its joins. While the name's lease lasts, only its holder may join again."""
