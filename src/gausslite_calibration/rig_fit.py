@@ -29,7 +29,7 @@ _POINTS_OF_PAIR = 4.0
 """Points of a frame have common errors: a pair counts as so many of them."""
 _MAX_DISTANCE_SHARE, _LEAST_GAIN = 0.6, 0.003
 """Of the median distance, as a share of the stated one and of the image's width."""
-_CERTAIN_STDS, _MOUNT_GAIN = 6.0, 0.7
+_CERTAIN_STDS, _CLEAR_GAIN, _MOUNT_GAIN = 6.0, 0.95, 0.7
 _MAX_FOCAL_CHANGE = math.log(3.0)
 """Beyond it, the points are no points of one camera."""
 _LEAST_MOUNT_M, _LEAST_MOUNT_DEG = 0.05, 5.0
@@ -98,10 +98,10 @@ class RigFit:
     distance: float
 
     def is_better_than(self, intrinsics: RigFit | None) -> bool:
-        """Return True for a mount that leaves less than other intrinsics do; small changes of both look alike."""
+        """Return True for a mount that leaves less than other intrinsics do, clearly, as it has more parameters."""
         if intrinsics is None:
             return True
-        return self.distance < (1.0 if intrinsics.words else _MOUNT_GAIN) * intrinsics.distance
+        return self.distance < (_CLEAR_GAIN if intrinsics.words else _MOUNT_GAIN) * intrinsics.distance
 
 
 def fit_intrinsics(motions: Sequence[PointMotion], width_px: int, limits: Limits) -> RigFit | None:
