@@ -151,8 +151,8 @@ def _ray_colours(
     rays = camera.rays(np.repeat(pixels, len(offsets)), columns, rows)
     hits = scene.cast(rays.origins_m, rays.directions)
     surface = Surface.of(scene, hits, rays.directions)
-    # geometric mean of a ray's footprints across and along the slope
-    width_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(_RAYS * np.maximum(surface.facing, 0.05))
+    # half the geometric mean of a ray's footprints across and along the slope: means of many rays blur by themselves
+    width_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(4 * _RAYS * np.maximum(surface.facing, 0.05))
     rgb = diffuse_colour(scene, hits, surface, width_m)
     add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
     return rgb.reshape(len(pixels), len(offsets), 3)
