@@ -33,6 +33,7 @@ class Group(StrEnum):
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
     POLICIES = "gausslite.policies"  # a `MapperSettings` of another system, to compare with; the name is of `--policy`
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
+    POSES = "gausslite.poses"  # refines the poses of views, or tracks the camera; the name is a value of `--poses`
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots

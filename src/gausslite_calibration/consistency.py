@@ -24,9 +24,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.recording import CameraCorrection
-from gausslite.pose_fit.features import RelativePose, detect_features, relative_pose
 from gausslite_calibration.depth_consistency import find_other_depth
 from gausslite_calibration.rig_fit import REGISTERED, UNREGISTERED, PointMotion, fit_intrinsics, fit_mount
+from gausslite_poses.features import RelativePose, detect_features, relative_pose
 
 _MAX_PAIRS, _MIN_PAIRS = 12, 4
 _SMALL_MOTION, _MIN_MOTION = 0.06, 0.012

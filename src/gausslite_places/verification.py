@@ -19,8 +19,8 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import orthonormal, transform_of
-from gausslite.pose_fit.photometric import COARSE_TO_FINE, FINE, align
 from gausslite.render.rasterizer import Rendering
+from gausslite_poses.photometric import COARSE_TO_FINE, FINE, align
 
 RenderMap = Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]
 """Renders a map from T_world_camera."""

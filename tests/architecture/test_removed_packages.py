@@ -22,7 +22,7 @@ SEQUENCE = "../fr1_cup"
 WORKING = (
     ("gausslite", "--help"),
     ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--roi", "../regions.npz", "--out", "roi"),
-    ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--poses", "track", "--out", "uniform"),
+    ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--out", "uniform"),
     ("gausslite_fusion_server", "--store", "fusion.sqlite"),
     ("gausslite_agent",),
 )
@@ -34,6 +34,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
     "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
     "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
+    "gausslite_poses": (
+        ("gausslite", "map", SEQUENCE, "--out", "refused", "--poses", "track"),
+        ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "pose-prior=0.01,0.5"),
+    ),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),

@@ -14,7 +14,7 @@ from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
-from gausslite.mapping.tracking import CameraTracker
+from gausslite.mapping.pose_estimation import CameraTracker, open_tracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import LoopMode, MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
@@ -64,8 +64,11 @@ def open_corrector(settings: MissionSettings, rasterizer: Rasterizer) -> PoseCor
 
 
 def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTracker | None:
-    """Return a tracker against the mapper's map; None if frames are mapped with their own poses."""
-    return CameraTracker(mapper.render) if settings.poses is PoseMode.TRACK else None
+    """Return a tracker against the mapper's map; None if frames are mapped with their own poses.
+
+    Raises MissingPluginError.
+    """
+    return open_tracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
 def chosen_detector(perception: PerceptionSettings) -> Detector | None:

@@ -23,9 +23,9 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.pose_corrector import LoopCounts
+from gausslite.mapping.pose_estimation import CameraTracker
 from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.task_change import Reevaluation
-from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming

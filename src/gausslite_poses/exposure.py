@@ -11,9 +11,9 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.pose_fit.least_squares import NormalEquations, robust_weights, shrinkage
-from gausslite.pose_fit.photometric import MAX_PIXELS, MIN_PIXELS, comparable_pixels, independent_share
 from gausslite.render.rasterizer import Rendering
+from gausslite_poses.least_squares import NormalEquations, robust_weights, shrinkage
+from gausslite_poses.photometric import MAX_PIXELS, MIN_PIXELS, comparable_pixels, independent_share
 
 _BLUR_PX = 15
 _FIT_GAIN_STD, _FIT_OFFSET_STD = 0.05, 0.015

@@ -20,7 +20,8 @@ from gausslite.domain.camera import Camera, back_project, lift
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_of, twist_of
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.pose_fit.least_squares import (
+from gausslite.render.rasterizer import NEAR_M, Rendering
+from gausslite_poses.least_squares import (
     MIN_STD,
     NormalEquations,
     robust_std,
@@ -28,7 +29,6 @@ from gausslite.pose_fit.least_squares import (
     shrinkage,
     weights_at,
 )
-from gausslite.render.rasterizer import NEAR_M, Rendering
 
 OPAQUE_ALPHA = 0.8
 """Pixels of a higher alpha count as covered by the map."""

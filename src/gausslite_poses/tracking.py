@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import (
@@ -24,9 +24,9 @@ from gausslite.domain.pose import (
     twist_of,
 )
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
-from gausslite.pose_fit.features import FeatureView, detect_features, relative_pose
-from gausslite.pose_fit.photometric import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
-from gausslite.render.rasterizer import Rendering
+from gausslite.mapping.pose_estimation import RenderMap
+from gausslite_poses.features import FeatureView, detect_features, relative_pose
+from gausslite_poses.photometric import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
 
 _MIN_DISTANCE_M, _MIN_ANGLE_DEG = 0.25, 15.0
 """A keyframe is added if no other one is as near in both."""
@@ -144,7 +144,7 @@ class CameraTracker:
     thread-safe.
     """
 
-    def __init__(self, render: Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]) -> None:
+    def __init__(self, render: RenderMap) -> None:
         """Render: renders the map from T_world_camera, for the camera's motion while a frame was exposed."""
         self._render = render
         self._keyframes = KeyframeIndex()

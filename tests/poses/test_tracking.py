@@ -15,15 +15,15 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.domain.state import select_prefix
-from gausslite.mapping.tracking import CameraTracker, KeyframeIndex
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
-from gausslite.pose_fit.features import detect_features, relative_pose
-from gausslite.pose_fit.photometric import align
 from gausslite.render.rasterizer import Rendering
 from gausslite_evaluation.metrics import trajectory_error
+from gausslite_poses.features import detect_features, relative_pose
+from gausslite_poses.photometric import align
+from gausslite_poses.tracking import CameraTracker, KeyframeIndex
 
 PRIOR_STD = np.array([0.1] * 3 + [0.1] * 3)
 SETTINGS = MissionSettings(policy="uniform", max_gaussians=20_000, threads=1, poses=PoseMode.TRACK)
