@@ -27,7 +27,7 @@ from gausslite.pages import BeginView
 from gausslite.process import print_message
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
-from gausslite_view.map_page import MapPage, TaskField
+from gausslite_view.map_page import MapPage, TaskField, text_html
 from gausslite_view.pages import open_page
 from gausslite_view.plots import HistoryPlot, QualityPlot
 from gausslite_view.pointing import PointingPanel
@@ -104,7 +104,9 @@ class MissionView:
         self._requests = MissionRequests(mission)
         gui = page.server.gui
         with gui.add_folder("Task", order=0):
-            self._task = TaskField(gui, self._requests.assign, "" if mission.graph is None else mission.graph.text)
+            self._current = gui.add_html("")
+            TaskField(gui, self._requests.assign, "" if mission.graph is None else mission.graph.text)
+        self._show_task()
         self._pointing = PointingPanel(page, self._requests)
         self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):
@@ -115,6 +117,7 @@ class MissionView:
     def update(self, outcome: FrameOutcome) -> None:
         """Answer the page after a frame; draw the map if the next drawing is due and nobody points."""
         self._requests.answer()
+        self._show_task()
         now_s = time.monotonic()
         if now_s < self._due_s or not outcome.gaussians or self._page.is_held:
             return
@@ -131,6 +134,13 @@ class MissionView:
         self._page.show(contents)
         ended_s = time.monotonic()
         self._due_s = max(now_s + _INTERVAL_S, ended_s + (ended_s - now_s) * (1 / _MOST_SHARE - 1))
+
+    def _show_task(self) -> None:
+        """Show the sentence that is mapped for: the field may hold one that was refused."""
+        graph = self._mission.graph
+        shown = text_html([f"task: {graph.text}" if graph is not None and graph.text else "no task"])
+        if self._current.content != shown:
+            self._current.content = shown
 
     def end(self) -> None:
         """Refuse what the page still asks."""

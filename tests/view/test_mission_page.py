@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
@@ -15,7 +15,7 @@ from urllib.request import urlopen
 import pytest
 from browser import open_browser, point
 from mapping_scenes import wall_frame
-from page_controls import control
+from page_controls import control, text
 from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
@@ -215,3 +215,15 @@ def test_the_page_is_there_before_the_mission_and_refuses_after_it(capsys: pytes
         begin(mission())
     with pytest.raises(URLError):
         urlopen(url)
+
+
+def test_the_current_task_stands_on_the_page_also_while_the_field_has_another() -> None:
+    searched = mission()
+    with closing(open_page(0, "test")) as page:
+        view = MissionView(page, searched)
+        control(page, "Task").value = "Find the qqq"
+        assert "task: Find the mug" in text(page)
+        searched.assign(RuleParser().parse("Find the lamp"))
+        view.update(searched.process(wall_frame()))
+        assert "task: Find the lamp" in text(page)
+        view.end()
