@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AgentClient",
-    "AgentLink",
     "Answer",
     "BallRegion",
     "CalibratedSequence",

@@ -22,7 +22,7 @@ from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert import transform_from_message, values_of
 from gausslite.wire.convert_task import object_from_message
-from gausslite.wire.map_follower import FollowedMap, MapFollower
+from gausslite_link.map_follower import FollowedMap, MapFollower
 
 _STATES = {number: name.removeprefix("AGENT_STATE_").lower() for name, number in pb.AgentState.items()}
 _FRAMES = tuple(f"frames_{outcome}" for outcome in ("mapped", "skipped", "dropped", "rejected"))

@@ -13,7 +13,7 @@ from waiting import wait_until
 from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import UnavailableError
 from gausslite.wire.clients import AgentClient
-from gausslite.wire.robot import AgentLink, LinkSettings
+from gausslite_link.agent_link import AgentLink, LinkSettings
 
 SETTINGS = LinkSettings(poll_s=0.02, queue_frames=2, lossless=True)
 
