@@ -37,6 +37,8 @@ class Group(StrEnum):
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
+    REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
+    KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server

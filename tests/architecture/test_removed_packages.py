@@ -44,6 +44,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_evaluation": (("gausslite", "eval", "map.ply", SEQUENCE),),
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
     "gausslite_recorders": (),
+    "gausslite_refinement": (),
     "gausslite_link": (("gausslite", "view", "127.0.0.1:1"),),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),

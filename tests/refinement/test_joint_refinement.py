@@ -19,12 +19,12 @@ from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.keyframe_pool import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
 from gausslite.fusion.limits import Quotas
-from gausslite.fusion.refinement import Refinement, RefineProgress, RefineSettings
-from gausslite.fusion.refinement_views import RefineInput
+from gausslite.fusion.refinement import RefineInput, RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rasterizer
 from gausslite.wire.convert import decode_frame
+from gausslite_refinement.refinement import Refinement
 
 CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)
 QUICK = RefineSettings(iterations=6, report_every=2)

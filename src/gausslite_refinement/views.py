@@ -7,19 +7,17 @@ inside the footprint of the fused map, and not where the measured surface occlud
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int16, Int64
+from jaxtyping import Float32, Float64, Int16
 from numpy import ndarray
 
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame, without_depth_edges
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.keyframe_pool import AgentKeyframe
+from gausslite.fusion.refinement import RefineInput
 from gausslite.mapping.keyframes import roi_weights
 from gausslite.render.rasterizer import FULL_FRAME, Rasterizer, Subset, TrainingView
 
@@ -31,20 +29,6 @@ _MIN_AGREEMENT, _MIN_ALONE, _MIN_OF_BEST = 0.05, 0.5, 0.75
 """Least agreement; the same where no agent of the vote has keyframes; and least share of the median of the agent that
 agrees best, because a coarse map agrees less with every keyframe."""
 _UNEXPLAINED, BACKGROUND = -2, -1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RefineInput:
-    """The vote at a revision, and the team's keyframes in its frame.
-
-    regions: the voxels of its task's region that each agent wins; agents that win others only have an entry without.
-    """
-
-    gaussians: Gaussians
-    keyframes: Sequence[AgentKeyframe]
-    regions: Mapping[str, Int64[ndarray, " k"]]
-    grid: VoxelGrid
-    revision: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
