@@ -43,7 +43,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),
     "gausslite_evaluation": (("gausslite", "eval", "map.ply", SEQUENCE),),
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
-    "gausslite_recorders": (),
+    "gausslite_recorders": (("gausslite", "map", "../frames", "--out", "refused"),),
     "gausslite_refinement": (),
     "gausslite_link": (("gausslite", "view", "127.0.0.1:1"),),
     "gausslite_operations": (
@@ -64,7 +64,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_sim": (("gausslite", "map", "sim:home", "--out", "refused"),),
     "gausslite_bench": (("gausslite", "bench", "quality"),),
 }
-"""What each package adds to the command lines. A format of `gausslite_recorders` has no command of its own."""
+"""What each package adds to the command lines."""
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +75,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     voxels = np.stack(np.meshgrid(range(90, 120), range(-10, 10), range(20)), axis=-1).reshape(-1, 3)
     np.savez(folder / "regions.npz", voxel_size_m=0.1, cup_1=voxels.astype(np.int32))
     (folder / "detector.onnx").write_bytes(b"no model")
+    (folder / "frames").mkdir()
+    (folder / "frames" / "frame-000000.color.png").touch()
     return folder
 
 

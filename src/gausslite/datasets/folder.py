@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -15,16 +13,16 @@ from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera
-from gausslite.datasets.files import DepthUnits, load_rgbd, parse_numbers, read_rows
+from gausslite.datasets.files import DepthUnits, parse_numbers, read_rows
 from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, load_voxel_regions
-from gausslite.datasets.source import Source, excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.frame import MAX_COORDINATE_M, Frame
-from gausslite.domain.pose import Trajectory, UpAxis, require_rigid
+from gausslite.domain.frame import MAX_COORDINATE_M
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.relevance import Region
 
-_REPAIRABLE_DEVIATION = 0.05
+REPAIRABLE_DEVIATION = 0.05
 FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 """Upward direction of a world that a level first view defines."""
 
@@ -34,29 +32,6 @@ def is_lost(translation_m: Float64[ndarray, "3"], rotation: Float64[ndarray, "..
     return not (np.isfinite(translation_m).any() or np.isfinite(rotation).any()) or not rotation.any()
 
 
-def nearest_rigid(location: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-    """Return the pose with the nearest exact rotation, if its own is orthonormal up to rounding (|R Rᵀ - I| <= 0.05).
-
-    Raises PoseError with the location for NaN, infinity, a wrong last row, a reflection or a larger deviation.
-    """
-    if not np.isfinite(matrix).all():
-        bad = float(matrix[~np.isfinite(matrix)][0])
-        raise PoseError(f"{location}: expected a pose of finite numbers, got {bad}")
-    R = matrix[:3, :3]
-    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(R))
-    if deviation > _REPAIRABLE_DEVIATION or determinant <= 0:
-        raise PoseError(
-            f"{location}: expected a rigid pose (orthonormal rotation, determinant +1), "
-            f"got deviation {deviation:.3g} and determinant {determinant:.3g}"
-        )
-    U, _, Vt = np.linalg.svd(R)
-    T = matrix.copy()
-    T[:3, :3] = U @ Vt
-    require_rigid(location, T)
-    return T
-
-
 def pose_from_quaternion(
     location: str, translation_m: Float64[ndarray, "3"], quat_xyzw: Float64[ndarray, "4"]
 ) -> Float64[ndarray, "4 4"]:
@@ -64,7 +39,7 @@ def pose_from_quaternion(
     if not (np.isfinite(translation_m).all() and np.isfinite(quat_xyzw).all()):
         raise PoseError(f"{location}: expected a pose of finite numbers, got NaN or infinity")
     length = float(np.linalg.norm(quat_xyzw))
-    if abs(length - 1.0) > _REPAIRABLE_DEVIATION:
+    if abs(length - 1.0) > REPAIRABLE_DEVIATION:
         raise PoseError(f"{location}: expected a quaternion of length 1, got length {length:.3g}")
     x, y, z, w = quat_xyzw / length
     T = np.eye(4)
@@ -125,7 +100,6 @@ def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) 
 
 _ORIGIN_STEP_M = 10_000.0
 _EARTH_DIAMETER_M = 1.3e7
-_ORIGIN_POSES = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,9 +139,6 @@ class Origin:
     def __str__(self) -> str:
         """Return the coordinates."""
         return " ".join(f"{value:.0f}" for value in self.position_m)
-
-
-_RATE_HZ = 30
 
 
 class FolderSource(Source):
@@ -255,86 +226,6 @@ class FolderSource(Source):
         """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
         path = self.regions_file
         return {} if path is None else balls_for_small_objects(load_voxel_regions(path))
-
-
-class NumberedFolderSource(FolderSource):
-    """Numbered image files at 30 Hz. Frames without a pose are excluded, or have the identity if none is required."""
-
-    _colours: dict[int, Path]
-    _numbers: list[int]
-    _require_poses: bool
-
-    def _find_colours(self, folder: Path, paths: Iterable[Path], pattern: re.Pattern[str], expected: str) -> None:
-        """Find the colour images by their names. Raises DatasetError if there are none."""
-        matches = (pattern.fullmatch(path.name) for path in paths)
-        colours = {int(match.group(1)): folder / match.group(0) for match in matches if match}
-        require_frames(folder, len(colours), f"images named {expected}")
-        self._colours = dict(sorted(colours.items()))
-
-    def _select_frames(self, require_poses: bool) -> None:
-        """Exclude the frames without a pose if poses are required. Raises DatasetError if none is left."""
-        self._require_poses = require_poses
-        self._numbers = [number for number in self._colours if not require_poses or not self._is_lost(number)]
-        require_frames(self._folder, len(self._numbers), "frames with a pose")
-        some = self._numbers[:: -(-len(self._numbers) // _ORIGIN_POSES)]
-        positions_m = [self._read_matrix(number)[:3, 3] for number in some if self._has_pose(number)]
-        self._origin = Origin.near(np.array(positions_m).reshape(-1, 3))
-
-    @abstractmethod
-    def _depth_path(self, number: int) -> Path:
-        """Return the path of a frame's depth image."""
-
-    @abstractmethod
-    def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
-        """Return a frame's pose as its file states it. Raises DatasetError."""
-
-    @abstractmethod
-    def _pose_location(self, number: int) -> str:
-        """Return the file, or the file and row, of a frame's pose, for error messages."""
-
-    @property
-    def excluded_frames(self) -> str:
-        """Message on the frames without a pose."""
-        return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """Return the frame at position i. Raises DatasetError, PoseError."""
-        require_position(self.name, i, len(self))
-        number = self._numbers[i]
-        T_world_camera = self._read_pose(number)
-        image = load_rgbd(self._colours[number], self._depth_path(number), self._camera, self._units, size)
-        return image.frame(number, number * 10**9 // _RATE_HZ, T_world_camera)
-
-    def indices(self) -> Sequence[int]:
-        """Return the numbers in the file names."""
-        return list(self._numbers)
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses at the frames' times."""
-        poses = [self._read_pose(number) for number in self._numbers]
-        return Trajectory(np.array(self._numbers) / _RATE_HZ, np.array(poses))
-
-    def _is_lost(self, number: int) -> bool:
-        try:
-            T = self._read_matrix(number)
-            return is_lost(T[:3, 3], T[:3, :3])
-        except (DatasetError, PoseError):
-            return False  # `frame` reports a damaged pose if it is used
-
-    def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
-        if not self._require_poses and not self._has_pose(number):
-            return np.eye(4)
-        return self._origin.moved(nearest_rigid(self._pose_location(number), self._read_matrix(number)))
-
-    def _has_pose(self, number: int) -> bool:
-        try:
-            T = self._read_matrix(number)
-            return not is_lost(T[:3, 3], T[:3, :3])
-        except (DatasetError, PoseError):
-            return False
 
 
 class FolderSourceClass(Protocol):

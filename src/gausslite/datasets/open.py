@@ -9,8 +9,6 @@ from typing import Final
 from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.corrected import UndistortedColourSource
 from gausslite.datasets.folder import FolderReader
-from gausslite.datasets.replica import ReplicaSource
-from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source, SourceReader
 from gausslite.datasets.tum import TumSource
 from gausslite.domain.checks import require_name
@@ -19,11 +17,7 @@ from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, installed, load, names
 
-_LAYOUTS: Final[tuple[SourceReader, ...]] = (
-    FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"),
-    FolderReader(SevenScenesSource, "7-Scenes (frame-000000.color.png ...)"),
-    FolderReader(ReplicaSource, "Replica (results/frame000000.jpg, traj.txt)"),
-)
+_TUM: Final[SourceReader] = FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)")
 _COMPRESSED = (".zip", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".7z", ".zst", ".zstd", ".lz4")
 
 
@@ -79,8 +73,8 @@ def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
 
 
 def _readers() -> Iterator[SourceReader]:
-    """Yield those of the core first: the packages of others are imported only if they are asked."""
-    yield from _LAYOUTS
+    """Yield that of the core first: the packages of others are imported only if they are asked."""
+    yield _TUM
     for _, reader in installed(Group.SOURCES):
         yield reader
 

@@ -14,11 +14,11 @@ from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes
 from gausslite.cli import map_command
 from gausslite.cli.main import main
 from gausslite.codec.state_file import read_state
-from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
 from gausslite.mapping.poses import PoseTable
 from gausslite.mission.runner import FrameStream, OnCorrupt
 from gausslite.process import DeferredInterrupt
+from gausslite_recorders.sevenscenes import SevenScenesSource
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 

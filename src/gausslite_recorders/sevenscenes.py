@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,10 +12,11 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
 from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
-from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, estimate_up
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader, estimate_up
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite_recorders.numbered_folder import NumberedFolderSource
 
 _UNITS = DepthUnits(per_metre=1000.0)
 _COLOUR_NAME = re.compile(r"frame-(\d{6})\.color\.(?:png|jpg)")
@@ -90,3 +92,6 @@ def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
             f"expected the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
     return FolderCamera(_KINECT.camera(str(folder), width_px, height_px))
+
+
+SEVEN_SCENES: Final = FolderReader(SevenScenesSource, "7-Scenes (frame-000000.color.png ...)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,9 +12,10 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import CAMERA_FILE, find_in_or_above, read_json_camera
 from gausslite.datasets.files import DepthUnits, parse_numbers, read_rows
-from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite_recorders.numbered_folder import NumberedFolderSource
 
 _COLOUR_NAME = re.compile(r"frame(\d{6})\.(?:jpg|png)")
 
@@ -63,3 +65,6 @@ class ReplicaSource(NumberedFolderSource):
             raise DatasetError(f"{self._folder}: expected a pose of frame {number} in traj.txt, got none")
         location, fields = self._pose_rows[number]
         return np.array(parse_numbers(location, fields, 16, "a 4x4 pose, row by row")).reshape(4, 4)
+
+
+REPLICA: Final = FolderReader(ReplicaSource, "Replica (results/frame000000.jpg, traj.txt)")
