@@ -103,23 +103,27 @@ def _colours(
 def _edges(
     scene: HomeScene, camera: RayCamera, hits: Hits, surface: Surface, steps: Float32[ndarray, "2 n 2"]
 ) -> Bool[ndarray, " n"]:
-    """Return the pixels in whose corners another texture shows, or other coordinates or light than predicted."""
+    """Return the pixels where another texture shows, or other coordinates or light than predicted.
+
+    Their corners are looked at, and the middles of their upper and lower sides.
+    """
     table, (height, width) = scene.triangles, camera.shape
-    probe_row, probe_column = np.divmod(np.arange((height + 1) * (width + 1)), width + 1)
+    probes = 2 * width + 1
+    probe_row, probe_column = np.divmod(np.arange((height + 1) * probes), probes)
     exposed = np.minimum(probe_row, height - 1) * width
-    rays = camera.rays(exposed, probe_column.astype(np.float32), probe_row.astype(np.float32))
+    rays = camera.rays(exposed, probe_column.astype(np.float32) / 2, probe_row.astype(np.float32))
     probed = scene.cast(rays.origins_m, rays.directions)
     footprint = np.maximum(np.abs(steps).max(axis=(0, 2)), np.float32(1 / SIDE_PX))
     row, column = np.divmod(camera.pixels(), width)
     edge = np.zeros(len(row), np.bool_)
-    for below, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        at = (row + below) * (width + 1) + column + right
+    for below, right in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)):
+        at = (row + below) * probes + 2 * column + right
         # within one triangle the prediction holds
         other = np.flatnonzero(probed.triangle[at] != hits.triangle)
         at = at[other]
         found = Hits(probed.triangle[at], probed.barycentric[at], probed.distance[at])
         seen = Surface.of(scene, found, rays.directions[at])
-        predicted = surface.uv[other] + (right - 0.5) * steps[0][other] + (below - 0.5) * steps[1][other]
+        predicted = surface.uv[other] + (0.5 * right - 0.5) * steps[0][other] + (below - 0.5) * steps[1][other]
         error = seen.uv - predicted
         differs = np.abs(error - np.rint(error)).max(axis=1) > _UV_TOLERANCE * footprint[other]
         differs |= np.abs(seen.light - surface.light[other]).max(axis=1) > _LIGHT_TOLERANCE
