@@ -29,7 +29,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
-from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
+from gausslite.mission.build import EstimatorBuilder, build_check, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.prior_map import PriorMap
@@ -279,6 +279,7 @@ class MappingWorker:
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
                 build_tracker(self._settings, self._mapper),
+                build_check(self._settings, in_background=True),
             )
         elif current is None or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign

@@ -108,9 +108,6 @@ class MapOptions:
     )
     overwrite: bool = option(False, "replace a map in --out (resume does so without this option)")
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
-    force: bool = option(
-        False, "map although poses or depth contradict the images (default: end with what would agree)"
-    )
     task_at: tuple[str, ...] = option(
         (), "switch to another task at this frame number", metavar="FRAME:TASK", repeats=True
     )

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
+import gausslite
 from gausslite.config.option import nearest, suggestion
 from gausslite.config.plain_values import describe_range, is_within, read_plain, without_password
 from gausslite.domain.errors import InvalidInputError
@@ -13,6 +14,14 @@ from gausslite.process import printable
 
 PARSER = "_parser"
 """Name of the chosen command's parser among parsed arguments."""
+
+
+class _PrintVersion(argparse.Action):
+    """Print the version of the installed distribution, which is looked up only on request."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(parser.prog, gausslite.__version__)
+        parser.exit()
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -23,6 +32,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{**options, "allow_abbrev": False})
+        self.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
         # that of the chosen sub-command, whose help has the options
         self.set_defaults(**{PARSER: self})
 
