@@ -11,7 +11,7 @@ All names in `__all__` are imported on first use, so `import gausslite` loads ne
 
 from __future__ import annotations
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -68,10 +68,7 @@ _ERRORS = "gausslite.domain.errors"
 def __getattr__(name: str) -> Any:
     """Import a public name on first use. Raises AttributeError for other names."""
     if name == "__version__":
-        try:
-            return metadata.version("gausslite")
-        except metadata.PackageNotFoundError:
-            return "of a source tree that is not installed"
+        return import_module("gausslite.process").installed_version()
     if name not in __all__:
         raise AttributeError(f"module 'gausslite' has no attribute {name!r}")
     # a program that only catches errors does not load the library

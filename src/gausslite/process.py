@@ -22,6 +22,16 @@ from gausslite.domain.errors import MissingPluginError
 TASK_NOT_FOUND: Final = 3
 
 
+def installed_version() -> str:
+    """Return the version of the installed distribution, which is looked up only on request."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("gausslite")
+    except metadata.PackageNotFoundError:
+        return "of a source tree that is not installed"
+
+
 def printable(text: str) -> str:
     """Return the text with control characters and bytes of other encodings escaped.
 

@@ -278,8 +278,8 @@ class MappingWorker:
                 self._sent_voxels if self.uplink is not None else None,
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
-                build_tracker(self._settings, self._mapper),
-                build_check(self._settings, in_background=True),
+                tracker=build_tracker(self._settings, self._mapper),
+                check=build_check(self._settings, in_background=True),
             )
         elif current is None or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign

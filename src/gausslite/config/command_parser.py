@@ -6,11 +6,10 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-import gausslite
 from gausslite.config.option import nearest, suggestion
 from gausslite.config.plain_values import describe_range, is_within, read_plain, without_password
 from gausslite.domain.errors import InvalidInputError
-from gausslite.process import printable
+from gausslite.process import installed_version, printable
 
 PARSER = "_parser"
 """Name of the chosen command's parser among parsed arguments."""
@@ -20,7 +19,7 @@ class _PrintVersion(argparse.Action):
     """Print the version of the installed distribution, which is looked up only on request."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        print(parser.prog, gausslite.__version__)
+        print(parser.prog, installed_version())
         parser.exit()
 
 

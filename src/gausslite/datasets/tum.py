@@ -211,7 +211,7 @@ def _read_poses(path: Path, required: bool) -> PoseTrack | None:
         raise DatasetError(f"{path}: expected finite times in ascending order")
     times_s, translations_m, quats_xyzw = table[known, 0], table[known, 1:4], table[known, 4:8]
     lost_s = table[~known, 0]
-    return PoseTrack(str(path), times_s, translations_m, quats_xyzw, MAX_POSE_GAP_S, _MAX_POSE_LAG_S, lost_s)
+    return PoseTrack(str(path), times_s, translations_m, quats_xyzw, MAX_POSE_GAP_S, _MAX_POSE_LAG_S, lost_s=lost_s)
 
 
 def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:

@@ -111,7 +111,7 @@ MAX_DEPTH_M = 65.535
 """Farthest depth on the wire; no sensor measures a room beyond it."""
 _FAR_SHARE = 0.9
 NO_DEPTH, ONE_COLOUR = "no pixel has a depth reading", "the colour image has one colour"
-TOO_FAR = f"depth lies beyond {MAX_DEPTH_M:g} m; is its unit metres, or are these millimetres"
+TOO_FAR = "depth lies beyond 65.5 m, as millimetres that are read as metres do"
 
 
 def is_too_far(depth_m: Float32[ndarray, "h w"]) -> bool:
