@@ -260,6 +260,9 @@ def test_nav2_grid_has_obstacles_floor_and_unknown_cells(tmp_path):
     assert cell(0.2, -0.2) == 0
     assert cell(0.8, -0.8) == 254  # the floor
     assert set(np.unique(image)) <= {0, 205, 254}
+    # as map servers load it, whether they compare with a threshold itself or beyond it
+    share = {grey: (255 - grey) / 255 for grey in (0, 205, 254)}
+    assert share[254] < described["free_thresh"] < share[205] < described["occupied_thresh"] < share[0]
 
 
 @pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.0, 0.6, -0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])

@@ -119,6 +119,13 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
         DatasetError,
         "rgb.txt: .* got a gzip archive; unpack it first",
     ),
+    (
+        "tum",
+        lambda f: (f / "groundtruth.txt").write_text("1305031453,5 0,1 0 0 0 0 0 1\n"),
+        DatasetError,
+        "groundtruth.txt line 1: expected a point as the decimal mark, got the decimal comma of '1305031453,5'",
+    ),
+    ("tum", lambda f: (f / "rgb.txt").write_text("10,5 rgb/0.png\n"), DatasetError, "rgb.txt line 1: .* decimal comma"),
     ("seven", lambda f: cut(f / "frame-000004.color.png"), DatasetError, "frame-000004.color.png: expected a whole"),
     ("seven", lambda f: (f / "frame-000004.depth.png").unlink(), DatasetError, "000004.depth.png: expected an image"),
     ("seven", lambda f: write_colour(f / "frame-000004.depth.png"), DatasetError, "expected a 16-bit image"),

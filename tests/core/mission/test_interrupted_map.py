@@ -29,7 +29,7 @@ def mapped(sequence: Path, out: Path, *more: str) -> int:
     return main(["map", str(sequence), *WITHOUT_ESTIMATES, *region, "--out", str(out), *more])
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143)])
 def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
     number: signal.Signals,
     code: int,
