@@ -182,6 +182,8 @@ def run_refine(options: argparse.Namespace) -> int:
         if options.out is not None:
             write_atomic(options.out, client.export(Export("refined")))
             print(f"wrote {options.out}")
+        else:
+            print(f"get it with: gausslite fetch {options.address} --strategy refined --out refined.ply")
     return 0
 
 

@@ -320,6 +320,7 @@ class MappingWorker:
         assert self._task_mapper is not None
         frame = self._place(queued.frame)
         if frame is None:
+            self._update_notes((LOCALISING,))
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index
