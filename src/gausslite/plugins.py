@@ -24,6 +24,7 @@ class Group(StrEnum):
 
     COMMANDS = "gausslite.commands"  # a `Command`; the name is the sub-command
     SOURCES = "gausslite.sources"  # opens recordings; the name is the prefix of an address, as in "sim:home"
+    CAMERAS = "gausslite.cameras"  # reads the camera of another tool's files
     CALIBRATORS = "gausslite.calibrators"  # estimates what a recording does not state
     PARSERS = "gausslite.parsers"  # a `ParserBackend`, which reads a sentence as a task graph
     NOUNS = "gausslite.nouns"  # a `NounVocabulary`

@@ -230,7 +230,7 @@ def _find_in_places(source: Source, trajectory: Trajectory, pairs: Sequence[_Pai
     wrong = [pair for pair in pairs if pair.contradicts(_motions(T_world_camera, [pair])[0])]
     for first in _unusual_steps(T_world_camera):
         with suppress(DatasetError, PoseError):  # a frame that cannot be read is reported when it is mapped
-            pair = _match(images, first, first + 1)
+            pair = match_pair(images, first, first + 1)
             if pair is not None and pair.contradicts(_motions(T_world_camera, [pair])[0]):
                 wrong.append(pair)
     if not wrong:
@@ -309,7 +309,7 @@ def _matched_pairs(source: Source) -> list[_Pair]:
     pairs = []
     for first in sorted({round(position) for position in np.linspace(0, max(count - 2, 0), _MAX_PAIRS)}):
         try:
-            pair = _match(images, first, min(first + gap, count - 1))
+            pair = match_pair(images, first, min(first + gap, count - 1))
         except (DatasetError, PoseError):
             continue
         if pair is None:
@@ -325,7 +325,7 @@ def _rectified(source: Source) -> Source:
     return source if source.lens is None else CorrectedSource(source, CameraCorrection(source.lens))
 
 
-def _match(images: Source, first: int, second: int) -> _Pair | None:
+def match_pair(images: Source, first: int, second: int) -> _Pair | None:
     """Return the pair of these positions; None without enough common points. Raises DatasetError, PoseError."""
     size = downscaled_size(images.camera)
     reference, current = images.frame(first, size), images.frame(second, size)

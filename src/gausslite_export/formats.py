@@ -20,7 +20,7 @@ from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of
 from gausslite.mission.results import map_file, stated_up
-from gausslite.process import import_extra
+from gausslite.process import import_extra, print_message
 from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
 from gausslite_export.free_cells import free_voxels
 from gausslite_export.mesh import write_mesh
@@ -171,13 +171,38 @@ def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
+_OUTLIER_FACTOR, _LEAST_REACH_M = 20.0, 20.0
+
+
+def _without_outliers(content: MapContent) -> MapContent:
+    """Return the map without what lies, or reaches, 20 times as far from its middle as 99 % of it, with a message.
+
+    The cells of a grid cover all that is between; a single Gaussian of a wrong measurement would decide their number.
+    """
+    middle_m = np.median(content.chosen.means_m, axis=0)
+
+    def reach_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
+        largest: Float32[ndarray, " n"] = np.abs(gaussians.means_m - middle_m).max(axis=1) + gaussians.scales_m.max(
+            axis=1
+        )
+        return largest
+
+    reaches_m = reach_m(content.chosen)
+    limit_m = max(_LEAST_REACH_M, _OUTLIER_FACTOR * float(np.percentile(reaches_m, 99)))
+    far = int(np.count_nonzero(reaches_m > limit_m))
+    if far:
+        print_message(f"left out {far} Gaussians that lie or reach farther than {limit_m:.0f} m from the map's middle")
+    kept = content.gaussians.take(reach_m(content.gaussians) <= limit_m)
+    return replace(content, gaussians=kept, chosen=content.chosen.take(reaches_m <= limit_m))
+
+
 def _octomap(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    occupancy = _occupancy(settings)
+    content, occupancy = _without_outliers(content), _occupancy(settings)
     write_octomap(path, content.chosen, occupancy, _free(content, settings, occupancy))
 
 
 def _nav2(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    occupancy = _occupancy(settings)
+    content, occupancy = _without_outliers(content), _occupancy(settings)
     write_nav2(path, content.chosen, occupancy, _free(content, settings, occupancy))
 
 

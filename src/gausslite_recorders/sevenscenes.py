@@ -22,6 +22,10 @@ _UNITS = DepthUnits(per_metre=1000.0)
 _COLOUR_NAME = re.compile(r"frame-(\d{6})\.color\.(?:png|jpg)")
 _KINECT = FileIntrinsics(585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
+_ASSUMED = (
+    f"no file states the camera: that of 7-Scenes is assumed (focal length {_KINECT.fx:g} px); {CAMERA_FILE} or "
+    f"{INTRINSICS_FILE} in the folder states another"
+)
 _UP_POSES = 64
 
 
@@ -91,7 +95,7 @@ def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
             f"{folder}: the camera of {width_px}x{height_px} images is unknown: "
             f"expected the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
-    return FolderCamera(_KINECT.camera(str(folder), width_px, height_px))
+    return FolderCamera(_KINECT.camera(str(folder), width_px, height_px), note=_ASSUMED)
 
 
 SEVEN_SCENES: Final = FolderReader(SevenScenesSource, "7-Scenes (frame-000000.color.png ...)")

@@ -29,7 +29,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
-from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
+from gausslite.mission.build import EstimatorBuilder, build_check, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.prior_map import PriorMap
@@ -278,7 +278,8 @@ class MappingWorker:
                 self._sent_voxels if self.uplink is not None else None,
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
-                build_tracker(self._settings, self._mapper),
+                tracker=build_tracker(self._settings, self._mapper),
+                check=build_check(self._settings, in_background=True),
             )
         elif current is None or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign
@@ -319,6 +320,7 @@ class MappingWorker:
         assert self._task_mapper is not None
         frame = self._place(queued.frame)
         if frame is None:
+            self._update_notes((LOCALISING,))
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index

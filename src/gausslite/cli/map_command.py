@@ -22,7 +22,7 @@ from gausslite.datasets.open import default_world_frame, open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
-from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
+from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR, TOO_FAR
 from gausslite.domain.objects import found_text
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.task import TaskGraph
@@ -92,6 +92,7 @@ def tracking_text(report: Mapping[str, Any]) -> str:
 _SKIPS = {
     NO_DEPTH: "without depth",
     ONE_COLOUR: "of one colour",
+    TOO_FAR: "too far",
     REPEATED: "repeated",
     TRACKING_LOST: "lost by tracking",
 }
@@ -108,9 +109,6 @@ class MapOptions:
     )
     overwrite: bool = option(False, "replace a map in --out (resume does so without this option)")
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
-    force: bool = option(
-        False, "map although poses or depth contradict the images (default: end with what would agree)"
-    )
     task_at: tuple[str, ...] = option(
         (), "switch to another task at this frame number", metavar="FRAME:TASK", repeats=True
     )
@@ -399,7 +397,8 @@ def require_mappable_depth(mapped: MappedRun) -> None:
     spec, source, result = mapped.run.plan.source.spec, mapped.run.stream.source, mapped.result
     if result.totals.frames == 0:
         reasons = ", ".join(f"in {count} {reason}" for reason, count in result.totals.reasons.items())
-        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}")
+        advice = f"; {_depth_unit_advice(source)}" if TOO_FAR in result.totals.reasons else ""
+        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}{advice}")
     if result.stopped_by is None:
         raise DatasetError(
             f"{spec}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "

@@ -26,6 +26,7 @@ from numpy.typing import DTypeLike, NDArray
 from gausslite.codec.state_file import write_atomic
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.file_formats import FOREIGN_BYTES, foreign_format
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
 
@@ -262,7 +263,7 @@ def _header_extent(data: bytes) -> tuple[int, int]:
     """Return the offsets of the header's last line and of the first row."""
     end = data.find(b"\nend_header", 0, _MAX_HEADER_BYTES) + 1
     if not data.startswith(b"ply") or end == 0:
-        raise MapFileError("expected a PLY file, got something else")
+        raise MapFileError(f"expected a PLY file, got {foreign_format(data[:FOREIGN_BYTES]) or 'something else'}")
     start = data.find(b"\n", end, end + 12) + 1
     if start == 0:
         raise MapFileError("the header has no end")

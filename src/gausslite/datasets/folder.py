@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -292,12 +292,19 @@ def quat_xyzw(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
     return np.append(0.5 * np.sinc(half / np.pi) * rotation_rad, np.cos(half))
 
 
+MAX_POSE_GAP_S = 1.0
+"""Longest time between two poses to interpolate: slow localisation nodes publish map → odom once a second."""
+_ROUNDING_S = 1e-6
+"""Times are written in microseconds: a limit that they meet exactly is not exceeded."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTrack:
     """Poses T_parent_child at ascending times, with quaternions of about unit length in the order x y z w.
 
     location: file or topic, for error messages. Between two poses at most max_gap_s apart, positions are interpolated
-    linearly and rotations by slerp. In longer gaps and outside, a pose within max_lag_s is used.
+    linearly and rotations by slerp. In longer gaps, in those with a time at which tracking was lost (lost_s, ascending)
+    and outside, a pose within max_lag_s is used.
     """
 
     location: str
@@ -306,6 +313,7 @@ class PoseTrack:
     quats_xyzw: Float64[ndarray, "n 4"]
     max_gap_s: float
     max_lag_s: float
+    lost_s: Float64[ndarray, " m"] = field(default_factory=lambda: np.zeros(0))
 
     def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
         """Return the interpolated pose, or None if there is none near this time. Raises PoseError."""
@@ -313,10 +321,11 @@ class PoseTrack:
         after = int(np.searchsorted(times, time_s))
         before, after = max(after - 1, 0), min(after, len(times) - 1)
         gap_s = float(times[after] - times[before])
-        if before == after or gap_s > self.max_gap_s:
+        first_lost, last_lost = np.searchsorted(self.lost_s, (times[before], times[after]))
+        if before == after or gap_s > self.max_gap_s + _ROUNDING_S or first_lost < last_lost:
             # trajectories of keyframes have poses far apart, each at the timestamp of its image
             nearest = int(np.abs(times - time_s).argmin())
-            if abs(float(times[nearest]) - time_s) > self.max_lag_s:
+            if abs(float(times[nearest]) - time_s) > self.max_lag_s + _ROUNDING_S:
                 return None
             before, after, gap_s = nearest, nearest, 0.0
         share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0

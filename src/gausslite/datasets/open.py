@@ -13,12 +13,12 @@ from gausslite.datasets.source import Source, SourceReader
 from gausslite.datasets.tum import TumSource
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
+from gausslite.domain.file_formats import foreign_file
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, installed, load, names
 
 _TUM: Final[SourceReader] = FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)")
-_COMPRESSED = (".zip", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".7z", ".zst", ".zstd", ".lz4")
 
 
 def open_source(
@@ -102,7 +102,7 @@ def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
 def _unknown_address(spec: str, path: Path) -> DatasetError:
     found = "nothing there"
     if path.is_file():
-        found = "a compressed file; unpack it first" if path.suffix.lower() in _COMPRESSED else "a file"
+        found = foreign_file(path) or "a file"
     expected = _alternatives(["a folder with a sequence", *(reader.address for reader in _readers())])
     return DatasetError(f"{spec}: expected {expected}; got {found}{_absent_readers()}")
 

@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+from gausslite.datasets.calibration import FrameCheck, open_calibrator
 from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounMatch
@@ -71,6 +72,12 @@ def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTr
     return open_tracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
+def build_check(settings: MissionSettings, in_background: bool) -> FrameCheck | None:
+    """Return the check of live frames; None with `force`, and where their poses are not used."""
+    is_needed = settings.poses is not PoseMode.TRACK and not settings.force
+    return open_calibrator().frame_check(in_background) if is_needed else None
+
+
 def chosen_detector(perception: PerceptionSettings) -> Detector | None:
     """Open the user's detector file; None without one. Raises ModelFileError, InvalidInputError, MissingPluginError."""
     if perception.model is None:
@@ -96,6 +103,7 @@ def build_task_mapper(
     estimators: EstimatorFactory,
     roi: TaskGraph | Sequence[Region],
     prior: Gaussians | None = None,
+    check: FrameCheck | None = None,
 ) -> TaskMapper:
     """Return a mapper of an empty map, or of an earlier one. roi: a task, or regions of space; neither: uniform.
 
@@ -104,7 +112,8 @@ def build_task_mapper(
     estimator = estimators.build(roi) if isinstance(roi, TaskGraph) else region_estimator(roi)
     mapper = build_mapper(settings, prior)
     scheduler = FrameScheduler(settings.scheduler_settings)
-    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=build_tracker(settings, mapper))
+    tracker = build_tracker(settings, mapper)
+    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=tracker, check=check)
 
 
 class EstimatorFactory:

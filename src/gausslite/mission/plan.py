@@ -21,7 +21,7 @@ from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text, get_text
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.mapping.splat_table import require_memory
-from gausslite.mission.build import EstimatorFactory, build_task_mapper
+from gausslite.mission.build import EstimatorFactory, build_check, build_task_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.recording import (
@@ -131,7 +131,8 @@ class RunPlan:
     def task_mapper(self, scene: SceneInfo) -> TaskMapper:
         """Return a mapper for other frames. Raises InvalidInputError, ModelFileError, KernelError."""
         models = EstimatorFactory(self.perception, lambda: scene)
-        return build_task_mapper(self.mission, models, self.schedule.first or self.regions)
+        roi, check = self.schedule.first or self.regions, build_check(self.mission, in_background=False)
+        return build_task_mapper(self.mission, models, roi, check=check)
 
     def _stated(self, source: Source, saved: SavedRun | None) -> StatedValues:
         """Return what is not to be estimated: also what a saved run has, and what needs poses that are not used."""

@@ -317,6 +317,11 @@ class MissionSettings:
         "a keyframe that sees an earlier place again corrects poses and map, unless poses are exact (extra: slam); "
         "auto: if the extra is installed",
     )
+    force: bool = option(
+        False,
+        "map although poses or depth contradict the images (default: end or skip, with what would agree)",
+        metadata=MAY_CHANGE,
+    )
 
     def __post_init__(self) -> None:
         check_options(self)

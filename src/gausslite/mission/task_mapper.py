@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from gausslite.datasets.calibration import FrameCheck
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -103,18 +104,19 @@ class TaskMapper:
         scheduler: FrameScheduler | None = None,
         publish: Callable[[VoxelBatch], None] = lambda _batch: None,
         tracker: CameraTracker | None = None,
+        check: FrameCheck | None = None,
     ) -> None:
         """Without a scheduler, each frame gets the fixed number of iterations of the mapper's settings.
 
         publish gets the changed voxels of each frame; its duration counts as part of the frame. Without a tracker,
-        frames are mapped with their own poses.
+        frames are mapped with their own poses, unless the check refuses them.
         """
         self._estimator = estimator
         self._mapper = mapper
         self._sent_voxels = sent_voxels
         self._scheduler = scheduler or FrameScheduler()
         self._publish = publish
-        self._tracker = tracker
+        self._tracker, self._check = tracker, check
         self._detected: DetectedImage | None = None
         self._defects: dict[str, int] = {}
         self._last_image = LastImage()
@@ -152,7 +154,8 @@ class TaskMapper:
         defects = (
             f"frames are skipped in which {defect}; the first one is {index}" for defect, index in self._defects.items()
         )
-        return (*self._estimator.notes, *defects, *filter(None, [self._mapper.loops.describe()]))
+        refusals = () if self._check is None else self._check.notes
+        return (*self._estimator.notes, *refusals, *defects, *filter(None, [self._mapper.loops.describe()]))
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -247,12 +250,15 @@ class TaskMapper:
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.
 
-        A frame with a defect is skipped, one whose pose is not found by tracking, and one in which everything moves.
+        A frame with a defect is skipped, one that the check refuses, one without a tracked pose, and one in which
+        everything moves.
         """
         self._scheduler.begin(waited_s)
         repeats = self._last_image.is_repeated_by(frame)
         if defect := frame.defect or (REPEATED if repeats else ""):
             return self._skip_defect(frame, defect)
+        if self._check is not None and (refusal := self._check.refusal(frame)):
+            return self._skip(frame, refusal)
         posed = self._track(self._mapper.poses.add_odometry(frame))
         if posed is None:
             return self._skip(frame, TRACKING_LOST)
