@@ -35,6 +35,7 @@ from gausslite_export.occupancy import (
 )
 from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite_export.video import write_video
+from gausslite_render.harmonics import rotated
 
 _PCD_ROW = np.dtype(
     [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
@@ -105,10 +106,12 @@ def read_map(
     stored = read_stored_map(file)
     if not len(stored.gaussians):
         raise InvalidInputError(f"{path}: expected a map with at least one Gaussian, got an empty map")
-    gaussians = stored.gaussians.take(_largest_extent_m(stored.gaussians) <= max_extent_m)
+    near = _largest_extent_m(stored.gaussians) <= max_extent_m
+    gaussians, harmonics = stored.gaussians.take(near), stored.harmonics[near]
     if not len(gaussians):
         raise InvalidInputError(f"{path}: expected Gaussians within {max_extent_m:g} m of the origin, got none")
     chosen = gaussians if region == "all" else gaussians.take(gaussians.active)
+    harmonics = harmonics if region == "all" else harmonics[gaussians.active]
     if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
@@ -120,9 +123,8 @@ def read_map(
             f"{max_extent_m:g} m, got larger ones",
         )
     total = len(stored.gaussians) + stored.left_out
-    return MapContent(
-        gaussians, chosen, total - len(gaussians), notes, world_frame=stored.world_frame, views=views, report=report
-    )
+    kept = harmonics if harmonics.any() else None
+    return MapContent(gaussians, chosen, total - len(gaussians), notes, stored.world_frame, views, report, kept)
 
 
 def upright(content: MapContent) -> MapContent:
@@ -142,6 +144,7 @@ def upright(content: MapContent) -> MapContent:
         content,
         gaussians=move_gaussians(content.gaussians, T),
         chosen=move_gaussians(content.chosen, T),
+        harmonics=None if content.harmonics is None else rotated(content.harmonics, T[:3, :3]),
         views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
         notes=(*content.notes, note),
     )
@@ -202,17 +205,25 @@ def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
 
 
 PLY: Final = Format(
-    ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
+    ".ply",
+    "3D Gaussian splatting PLY",
+    lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame, map_.harmonics),
+    keeps_harmonics=True,
 )
 SPZ: Final = Format(
     ".spz",
     "compressed splats (SPZ)",
-    lambda path, map_, _: write_spz(path, map_.chosen),
+    lambda path, map_, _: write_spz(path, map_.chosen, map_.harmonics),
     max_extent_m=MAX_SPZ_COORDINATE_M,
+    keeps_harmonics=True,
 )
 SPLAT: Final = Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen))
 GLTF: Final = Format(
-    ".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen), is_upright=True
+    ".glb",
+    "KHR_gaussian_splatting",
+    lambda path, map_, _: write_gltf(path, map_.chosen, map_.harmonics),
+    is_upright=True,
+    keeps_harmonics=True,
 )
 PCD: Final = Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen))
 LAS: Final = Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen))
