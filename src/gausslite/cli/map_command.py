@@ -43,7 +43,7 @@ from gausslite.mission.results import (
     write_results,
 )
 from gausslite.mission.runner import MissionResult
-from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, TaskSchedule, Timeline
+from gausslite.mission.schedule import MapRecorder, TaskSchedule, Timeline
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
@@ -53,7 +53,7 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome
-from gausslite.pages import load_pages
+from gausslite.pages import BeginView, load_pages
 from gausslite.plugins import Group, load
 from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt
 from gausslite.render.map_viewer import view_map
@@ -215,14 +215,15 @@ def run(options: argparse.Namespace) -> int:
     with locked_folder(options.out):
         if options.save_state is not None:
             require_additional_file(options.save_state, options.out)
-        return _map(options, plan.open())
+        with _page(options.view) as begin_view:
+            return _map(options, run := plan.open(), begin_view(run.scheduled))
 
 
-def _map(options: argparse.Namespace, run: OpenRun) -> int:
+def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None]) -> int:
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
         timeline, recorder = Timeline(), MapRecorder()
-        mapped = _map_frames(options, run, timeline, recorder)
+        mapped = _map_frames(options, run, draw, timeline, recorder)
         written = _write_results(options, mapped, timeline, recorder) if mapped.is_worth_keeping else None
     # an early end keeps the map so far; the exit code reports it
     if isinstance(mapped.result.stopped_by, KeyboardInterrupt):
@@ -237,10 +238,16 @@ def _map(options: argparse.Namespace, run: OpenRun) -> int:
     return 0 if mapped.has_found_task else TASK_NOT_FOUND
 
 
-def _map_frames(options: argparse.Namespace, run: OpenRun, timeline: Timeline, recorder: MapRecorder) -> MappedRun:
+def _map_frames(
+    options: argparse.Namespace,
+    run: OpenRun,
+    draw: Callable[[FrameOutcome], None],
+    timeline: Timeline,
+    recorder: MapRecorder,
+) -> MappedRun:
     """Map all frames with a bar. Raises DatasetError if frames exist and none of them can be used."""
     mapper = run.scheduled.mapper
-    with _view(options.view, run.scheduled) as draw, MappingBar(len(run.stream)) as bar:
+    with MappingBar(len(run.stream)) as bar:
 
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
@@ -356,11 +363,11 @@ def _outcome(mapped: MappedRun, scores: TrainingFit | None) -> str:
     return "; ".join(parts)
 
 
-def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
-    """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
+def _page(port: int | None) -> AbstractContextManager[BeginView]:
+    """Return the page of a run; no page without a port."""
     if port is None:
-        return nullcontext(lambda _outcome: None)
-    return load_pages("--view").mission_view(port, mission)
+        return nullcontext(lambda _mission: lambda _outcome: None)
+    return load_pages("--view").mission_view(port)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult, written: _Written | None) -> str:
