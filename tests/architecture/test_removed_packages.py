@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),
     "gausslite_evaluation": (("gausslite", "eval", "map.ply", SEQUENCE),),
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
+    "gausslite_render": (("gausslite", "render", "map.ply", "--poses", "a", "--out", "refused"),),
     "gausslite_recorders": (),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),
