@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
@@ -18,7 +18,7 @@ from gausslite.codec.run_files import read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
-from gausslite.domain.pose import transform_of
+from gausslite.domain.pose import transform_of, twist_of
 from gausslite.mission.results import map_file, stated_up
 from gausslite.process import import_extra
 from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
@@ -130,13 +130,14 @@ def read_map(
 def upright(content: MapContent) -> MapContent:
     """Return the map turned so that z points up, with a note, if its up is stated. Raises InvalidInputError."""
     up = np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
-    axis = np.array((up[1], -up[0], 0.0))
-    length = float(np.linalg.norm(axis))
-    if length < _LEAST_TURN and up[2] > 0:
+    T = upright_motion(up)
+    turn_rad = twist_of(T)[3:]
+    angle_rad = float(np.linalg.norm(turn_rad))
+    if angle_rad == 0.0:
         return content
-    angle_rad, axis = float(np.arctan2(length, up[2])), axis / length if length > 0 else np.array((1.0, 0.0, 0.0))
-    T = transform_of(np.concatenate([np.zeros(3), angle_rad * axis]))
-    about, shown = (",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (axis, up))
+    about, shown = (
+        ",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (turn_rad / angle_rad, up)
+    )
     note = (
         f"up is {shown} in the map: it is turned by {np.degrees(angle_rad):.1f} deg about {about}, so that z points up"
     )
@@ -148,6 +149,16 @@ def upright(content: MapContent) -> MapContent:
         views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
         notes=(*content.notes, note),
     )
+
+
+def upright_motion(up: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
+    """Return the smallest rotation after which this direction is z."""
+    axis = np.array((up[1], -up[0], 0.0))
+    length = float(np.linalg.norm(axis))
+    if length < _LEAST_TURN and up[2] > 0:
+        return np.eye(4)
+    angle_rad, axis = float(np.arctan2(length, up[2])), axis / length if length > 0 else np.array((1.0, 0.0, 0.0))
+    return transform_of(np.concatenate([np.zeros(3), angle_rad * axis]))
 
 
 def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:

@@ -88,9 +88,9 @@ def write_gltf(path: Path, gaussians: Gaussians, harmonics: Float32[ndarray, "n 
         "KHR_gaussian_splatting:OPACITY": gaussians.opacities,
         "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": _degree_0(gaussians),
     }
-    for i in range(0 if harmonics is None else harmonics.shape[2]):
+    for i, coefficients in enumerate([] if harmonics is None else harmonics.transpose(2, 0, 1)):
         degree = bisect_right(COUNTS, i)
-        columns[f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{i - COUNTS[degree - 1]}"] = harmonics[:, :, i]
+        columns[f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{i - COUNTS[degree - 1]}"] = coefficients
     write_atomic(path, _glb(columns, len(gaussians)))
 
 

@@ -70,7 +70,7 @@ def rotated(harmonics: Float32[ndarray, "n 3 k"], R: Float64[ndarray, "3 3"]) ->
     directions = np.random.default_rng(0).normal(size=(3, _DIRECTIONS))
     directions /= np.linalg.norm(directions, axis=0)
     count = harmonics.shape[2]
-    before, after = (np.stack(basis(at, count)) for at in (R.T @ directions, directions)) if count else ((), ())
+    before, after = (np.array(basis(at, count)) for at in (R.T @ directions, directions))
     result = np.empty(harmonics.shape, np.float32)
     for first, last in pairwise(COUNTS):
         if last <= count:

@@ -48,6 +48,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
     ),
     "gausslite_demo": (("gausslite", "demo", "--out", "refused"), ("gausslite", "doctor")),
+    "gausslite_mcp": (("gausslite", "mcp", "a"),),
     "gausslite_view": (
         ("gausslite", "report", "a"),
         ("gausslite", "view", "a"),
