@@ -164,7 +164,7 @@ def planar_grid(
         raise InvalidInputError(
             f"nav2: expected at most {_MAX_GRID_CELLS} cells, got {width} x {height}; use a larger --voxel"
         )
-    floor = _floor(voxels)
+    floor = floor_layer(voxels)
     above_m, free_above_m = ((found[:, 2] - floor) * settings.voxel_m for found in (voxels, free))
     low_m, high_m = settings.height_m
     inside = ((free >= first) & (free <= last))[:, :2].all(axis=1)
@@ -179,7 +179,7 @@ def planar_grid(
     return grid, first[:2]
 
 
-def _floor(voxels: Int64[ndarray, "v 3"]) -> int:
+def floor_layer(voxels: Int64[ndarray, "v 3"]) -> int:
     """Return the height of the floor: the fullest of the layers that rise from the lowest full one."""
     lowest = voxels[:, 2].min()
     layers = np.bincount(voxels[:, 2] - lowest)

@@ -46,6 +46,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_recorders": (("gausslite", "map", "../frames", "--out", "refused"),),
     "gausslite_refinement": (),
     "gausslite_link": (("gausslite", "view", "127.0.0.1:1"),),
+    "gausslite_render": (("gausslite", "render", "map.ply", "--poses", "a", "--out", "refused"),),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),
         ("gausslite", "fuse", "a.ply", "b.ply", "--out", "fused.ply"),
@@ -53,6 +54,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
     ),
     "gausslite_demo": (("gausslite", "demo", "--out", "refused"), ("gausslite", "doctor")),
+    "gausslite_mcp": (("gausslite", "mcp", "a"),),
     "gausslite_view": (
         ("gausslite", "report", "a"),
         ("gausslite", "view", "a"),
