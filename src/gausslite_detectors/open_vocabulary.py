@@ -17,16 +17,14 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
 from gausslite_detectors.boxes import BoxSizeLimits
+from gausslite_detectors.layouts import anchors_reading
 from gausslite_detectors.model_file import OpenModel, run_once
+from gausslite_detectors.network import MEAN, STANDARD_DEVIATION, Letterbox, candidates_of, letterbox, suppress
 from gausslite_detectors.text_features import PhraseInput, PhraseVectors, Tokenizer, encode_phrase
-from gausslite_detectors.yolo_network import Letterbox, decode, letterbox, suppress
 
 INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
 OUTPUTS: Final = ("logits", "pred_boxes")
 _REQUIRED_INPUTS: Final = frozenset({"pixel_values", "input_ids"})
-# normalisation of the network's training images: red, green, blue
-_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32)
-_STANDARD_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
 _SHORT_SIDE_PX: Final = 800
 _LONG_SIDE_PX: Final = 1333
 _TEST_PHRASE: Final = "object"
@@ -190,7 +188,7 @@ def preprocess(
     shrinks = inner_w < w
     scaled = cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     values = np.zeros((1, 3, height, width), np.float32)
-    normalised = (scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION
+    normalised = (scaled.astype(np.float32) / 255 - MEAN) / STANDARD_DEVIATION
     values[0, :, :inner_h, :inner_w] = normalised.transpose(2, 0, 1)
     mask = np.zeros((1, height, width), np.int64)
     mask[:, :inner_h, :inner_w] = 1
@@ -345,7 +343,8 @@ class PromptedYolo:
         self, query: str, rows: Float32[ndarray, "5 a"], letterboxing: Letterbox, frame: Frame
     ) -> list[DetectedBox]:
         size_px = (frame.camera.height_px, frame.camera.width_px)
-        candidates = decode(rows, 1, letterboxing, size_px, self._settings.min_score)
+        reading = anchors_reading(rows, 1, np.zeros((0, 1, 1), np.float32))
+        candidates = candidates_of(reading, letterboxing, size_px, self._settings.min_score)
         kept = suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=True)
         boxes = []
         for score, corners in zip(kept.scores, kept.boxes_px, strict=True):

@@ -16,8 +16,9 @@ from gausslite.domain.objects import MatchBasis
 from gausslite.perception.detector import Detector
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
+from gausslite_detectors.layouts import ModelFamily
 from gausslite_detectors.model_file import open_model
-from gausslite_detectors.models import READER, ModelFamily, identify_family
+from gausslite_detectors.models import READER, identify_family
 from gausslite_detectors.open_vocabulary import PromptedYolo
 from gausslite_detectors.text_features import ClipTextEncoder, NounVectorTable
 
