@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import DetectedBox, Detection, Rival
 from gausslite.nouns import is_generic, same_kind
-from gausslite_detectors.boxes import BoxSizeLimits, box_iou
+from gausslite_detectors.boxes import BoxSizeLimits, box_iou, with_unseen
 from gausslite_detectors.class_match import ClassMatchSettings, TextEmbeddings, class_nouns, match_noun
 from gausslite_detectors.class_names import names_file
 from gausslite_detectors.model_file import OpenModel
@@ -127,7 +127,8 @@ class ClassDetector:
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return the network's classes that match each query."""
         how = self._settings.class_match
-        return tuple(match_noun(query, self.class_names, self._embeddings, how) for query in queries)
+        found = (match_noun(query, self.class_names, self._embeddings, how) for query in queries)
+        return tuple(replace(match, min_score=self._settings.min_score) for match in found)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return all instances of each query with masks, best first, without boxes too large for their class."""
@@ -138,11 +139,12 @@ class ClassDetector:
         every = output.candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
         masks, overlaps = output.masks(candidates), self._overlaps(candidates, every)
-        return [
+        found = [
             Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak)
             for row, box in self._boxes(candidates, every, overlaps, query_classes, frame)
             if masks[row].any()
         ]
+        return with_unseen(found, self.best_boxes(frame, queries), frame)
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """Return the boxes of `detect` without masks."""
@@ -153,6 +155,15 @@ class ClassDetector:
         candidates = self._distinct(every, query_classes)
         overlaps = self._overlaps(candidates, every)
         return [box for _, box in self._boxes(candidates, every, overlaps, query_classes, frame)]
+
+    def best_boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
+        """Return the box of each query with the best score, below every threshold and of any size too."""
+        output, found = self._network.run(frame), []
+        for query, classes in self._query_classes(queries).items():
+            peak = output.peak(classes)
+            left, top, right, bottom = (float(edge) for edge in peak.boxes_px[0])
+            found.append(DetectedBox(query, float(peak.scores[0]), (left, top, right, bottom), is_weak=True))
+        return found
 
     def _query_classes(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
         """Return the class indices of each query that is searched."""
@@ -211,7 +222,12 @@ class ClassDetector:
         return None
 
 
-def load_class_detector(model: OpenModel, accept_similar: bool = False) -> ClassDetector:
+def load_class_detector(
+    model: OpenModel, accept_similar: bool = False, min_score: float | None = None
+) -> ClassDetector:
     """Return the detector with the text embeddings of the model's folder. Raises ModelFileError."""
     settings = ClassDetectorSettings(class_match=ClassMatchSettings(accept_similar=accept_similar))
+    if min_score is not None:
+        weak_score = min_score * settings.weak_score / settings.min_score
+        settings = replace(settings, min_score=min_score, weak_score=weak_score)
     return ClassDetector(model, TextEmbeddings.from_model_folder(model.path), settings)

@@ -61,6 +61,9 @@ class Reading:
     scores: Float32[ndarray, " m"]
     coefficients: Float32[ndarray, "n k"]
     masks: Float32[ndarray, "p h w"]
+    peak_rows: Int64[ndarray, " c"]
+    """The box of each class with its best score, whatever else that box rather shows."""
+    peak_scores: Float32[ndarray, " c"]
 
 
 Decoder = Callable[[Sequence[Array]], Reading]
@@ -173,7 +176,8 @@ def _query_layout(outputs: Outputs) -> Layout | None:
         best = np.argsort(-scores, axis=None, kind="stable")[:queries]
         of_boxes = _corners(arrays[boxes].astype(np.float32))
         own = arrays[maps[0]].astype(np.float32) if maps else _NO_MASKS
-        return Reading(of_boxes, best // classes, best % classes, scores.ravel()[best], _none(queries), own)
+        chosen = best // classes, best % classes, scores.ravel()[best]
+        return Reading(of_boxes, *chosen, _none(queries), own, scores.argmax(axis=0), scores.max(axis=0))
 
     is_hugging_face = bool(outputs.named("logits")) and classes != len(names_of({}, 91))
     fit = ImageFit.STRETCH if is_hugging_face else ImageFit.NORMALISE
@@ -201,9 +205,8 @@ def _labelled_layout(outputs: Outputs) -> Layout | None:
         if counts:
             scores = np.where(np.arange(len(scores)) < int(arrays[counts[0]][0]), scores, np.float32(0))
         own = arrays[maps[0]].astype(np.float32) if maps else _NO_MASKS
-        of_boxes = arrays[tables[0]].astype(np.float32)
-        rows = np.arange(len(scores))
-        return Reading(of_boxes, rows, arrays[labels].astype(np.int64), scores, _none(len(scores)), own)
+        of_boxes, of_classes = arrays[tables[0]].astype(np.float32), arrays[labels].astype(np.int64)
+        return _single(of_boxes, of_classes, scores, _none(len(scores)), own, classes)
 
     fit = ImageFit.LETTERBOX if counts else ImageFit.STRETCH
     family = ModelFamily.YOLO_BOXES if counts else ModelFamily.RT_DETR
@@ -226,7 +229,7 @@ def _yolo_layout(outputs: Outputs) -> Layout | None:
         classes = class_count(stated)
         return Layout(
             family, names_of(stated, classes), classes, bool(maps), ImageFit.LETTERBOX, True,
-            lambda arrays: _listed(arrays[table].astype(np.float32), prototypes(arrays)),
+            lambda arrays: _listed(arrays[table].astype(np.float32), prototypes(arrays), classes),
         )  # fmt: skip
     found = _classes_of_rows(outputs.arrays[table].shape, k, stated)
     if found is None:
@@ -266,9 +269,25 @@ def _classes_of_rows(shape: tuple[int, ...], k: int, stated: Mapping[int, str]) 
     return (classes, is_transposed) if classes >= 1 else None
 
 
-def _listed(table: Float32[ndarray, "n r"], prototypes: Float32[ndarray, "k h w"]) -> Reading:
-    rows = np.arange(len(table))
-    return Reading(table[:, :4], rows, table[:, 5].astype(np.int64), table[:, 4], table[:, 6:], prototypes)
+def _listed(table: Float32[ndarray, "n r"], prototypes: Float32[ndarray, "k h w"], count: int) -> Reading:
+    return _single(table[:, :4], table[:, 5].astype(np.int64), table[:, 4], table[:, 6:], prototypes, count)
+
+
+def _single(
+    boxes: Float32[ndarray, "n 4"],
+    classes: Int64[ndarray, " n"],
+    scores: Float32[ndarray, " n"],
+    coefficients: Float32[ndarray, "n k"],
+    masks: Float32[ndarray, "p h w"],
+    count: int,
+) -> Reading:
+    """Return the reading of boxes that have one of count classes each."""
+    rows = np.arange(len(boxes))
+    peak_rows, peak_scores = np.zeros(count, np.int64), np.zeros(count, np.float32)
+    for row in np.argsort(scores, kind="stable"):
+        if classes[row] < count:
+            peak_rows[classes[row]], peak_scores[classes[row]] = row, scores[row]
+    return Reading(boxes, rows, classes, scores, coefficients, masks, peak_rows, peak_scores)
 
 
 def anchors_reading(output: Float32[ndarray, "r a"], classes: int, prototypes: Float32[ndarray, "k h w"]) -> Reading:
@@ -276,7 +295,10 @@ def anchors_reading(output: Float32[ndarray, "r a"], classes: int, prototypes: F
     scores = output[4 : 4 + classes]
     best = scores.argmax(axis=0)
     rows = np.arange(output.shape[1])
-    return Reading(_corners(output[:4].T), rows, best, scores[best, rows], output[4 + classes :].T, prototypes)
+    peaks = scores.argmax(axis=1)
+    peak_scores = scores[np.arange(classes), peaks]
+    chosen = rows, best, scores[best, rows]
+    return Reading(_corners(output[:4].T), *chosen, output[4 + classes :].T, prototypes, peaks, peak_scores)
 
 
 _MAX_SHARE: Final = 2.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -138,7 +138,12 @@ class OnnxReader:
 
     def open(self, path: Path, options: DetectorOptions) -> Detector:
         """Return the file's detector, also in tiles. Raises ModelFileError, InvalidInputError, KernelError."""
+        from gausslite_detectors.class_detector import ClassDetectorSettings
+
         tiling = Tiling(options.tiles_per_side, options.time_limit_s)
+        if options.min_score is not None:
+            least = options.min_score / ClassDetectorSettings().min_score * tiling.min_new_score
+            tiling = replace(tiling, min_new_score=min(least, tiling.min_new_score))
         detector = self._open(path, options)
         return detector if tiling.per_side == 1 else TiledDetector(detector, tiling)
 
@@ -154,7 +159,7 @@ class OnnxReader:
         family = _family_of_text(model)
         if family is ModelFamily.TEXT_ENCODER:
             raise ModelFileError(f"model {path}: expected a detector, got a {family}, which belongs beside one")
-        classes = load_class_detector(model, options.accept_similar) if family is None else None
+        classes = load_class_detector(model, options.accept_similar, options.min_score) if family is None else None
         if classes is not None and classes.has_masks and options.segmenter in (None, OWN_MASKS):
             return classes
         if options.segmenter == OWN_MASKS:
@@ -176,13 +181,17 @@ READER: Final = OnnxReader()
 
 def _open_vocabulary(model: OpenModel, family: ModelFamily | None, options: DetectorOptions) -> BoxDetector:
     """Return a detector of any phrase with its text encoder."""
-    from gausslite_detectors.open_vocabulary import GroundingDino, PromptedYolo
+    from gausslite_detectors.open_vocabulary import GroundingDino, GroundingSettings, PromptedYolo, PromptedYoloSettings
     from gausslite_detectors.text_features import BertTokenizer, open_phrase_vectors
 
     folder = model.path.parent
+    least = options.min_score
     if family is ModelFamily.GROUNDING_DINO:
-        return GroundingDino(model, BertTokenizer(options.vocabulary or folder / VOCABULARY))
-    return PromptedYolo(model, open_phrase_vectors(folder, options.vocabulary, options.threads))
+        tokenizer = BertTokenizer(options.vocabulary or folder / VOCABULARY)
+        settings = GroundingSettings() if least is None else GroundingSettings(0.8 * least, least)
+        return GroundingDino(model, tokenizer, settings)
+    vectors = open_phrase_vectors(folder, options.vocabulary, options.threads)
+    return PromptedYolo(model, vectors, PromptedYoloSettings() if least is None else PromptedYoloSettings(least))
 
 
 def _segmenters(name: str, threads: int | None) -> tuple[Segmenter, ...]:

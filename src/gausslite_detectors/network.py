@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -83,12 +84,20 @@ def stretched(
 def candidates_of(reading: Reading, letterboxing: Letterbox, size_px: tuple[int, int], min_score: float) -> Candidates:
     """Return the candidates that reach min_score, clipped to an image of size_px (height, width)."""
     kept = np.flatnonzero(reading.scores >= min_score)
-    rows = reading.rows[kept]
+    rows = reading.rows[kept].astype(np.int64)
+    boxes_px = boxes_in_image(reading.boxes[rows], letterboxing, size_px)
+    return Candidates(boxes_px, reading.scores[kept], reading.classes[kept].astype(np.int64), rows)
+
+
+def boxes_in_image(
+    boxes: Float32[ndarray, "n 4"], letterboxing: Letterbox, size_px: tuple[int, int]
+) -> Float32[ndarray, "n 4"]:
+    """Return boxes of the network's image in an image of size_px (height, width), clipped to it."""
     offset = np.array([letterboxing.left_px, letterboxing.top_px] * 2, np.float32)
     scale = np.array([letterboxing.scale_x, letterboxing.scale_y] * 2, np.float32)
     limits = np.array([size_px[1], size_px[0]] * 2, np.float32)
-    boxes_px = np.clip((reading.boxes[rows] - offset) / scale, 0, limits).astype(np.float32)
-    return Candidates(boxes_px, reading.scores[kept], reading.classes[kept].astype(np.int64), rows.astype(np.int64))
+    boxes_px: Float32[ndarray, "n 4"] = np.clip((boxes - offset) / scale, 0, limits).astype(np.float32)
+    return boxes_px
 
 
 def suppress(candidates: Candidates, max_iou: float, max_boxes: int, across_classes: bool) -> Candidates:
@@ -158,6 +167,13 @@ class NetworkOutput:
     def candidates(self, min_score: float) -> Candidates:
         """Return the candidates that reach min_score, unordered."""
         return candidates_of(self.reading, self.letterboxing, self.size_px, min_score)
+
+    def peak(self, classes: Sequence[int]) -> Candidates:
+        """Return the one box that has the best score of these classes, below every threshold too."""
+        index = np.array([max(classes, key=lambda each: self.reading.peak_scores[each])])
+        rows = self.reading.peak_rows[index]
+        boxes_px = boxes_in_image(self.reading.boxes[rows], self.letterboxing, self.size_px)
+        return Candidates(boxes_px, self.reading.peak_scores[index], index, rows)
 
     def masks(self, candidates: Candidates) -> list[Bool[ndarray, "h w"]]:
         """Return one mask per candidate; those of prototypes are False outside its box."""
@@ -262,7 +278,8 @@ class DetectionNetwork:
             is_normalised = self.layout.fit is ImageFit.NORMALISE
             tensor, letterboxing = stretched(frame.sharpest_rgb, *network_size_px, size_px, is_normalised)
         reading = self.layout.decode([_first(output) for output in self._session.run(None, self._input.feed(tensor))])
-        reading = replace(reading, scores=self._scale.to_unit(reading.scores))
+        scores, peak_scores = self._scale.to_unit(reading.scores), self._scale.to_unit(reading.peak_scores)
+        reading = replace(reading, scores=scores, peak_scores=peak_scores)
         reading = replace(reading, boxes=in_pixels(reading, network_size_px, self.path))
         unknown = reading.classes[reading.scores > 0].max(initial=0)
         if unknown >= self.layout.classes:

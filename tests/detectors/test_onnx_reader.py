@@ -121,6 +121,9 @@ def test_boxes_without_a_mask_are_dropped():
         def boxes(self, frame, queries):
             return [DetectedBox(queries[0], 0.9, (32, 16, 64, 48)), DetectedBox(queries[0], 0.8, (0, 0, 9, 9))]
 
+        def best_boxes(self, frame, queries):
+            return self.boxes(frame, queries)[:1]
+
     class LeftHalf:
         def segment(self, frame, boxes_px):
             return [np.ones(frame.depth_m.shape, np.bool_) if box[0] > 0 else None for box in boxes_px]

@@ -122,7 +122,7 @@ def test_a_table_of_text_vectors_replaces_the_encoder(tmp_path):
     assert found[0].mask.sum() == 24 * 24
     tankard, umbrella = detector.matches(["beer tankard", "umbrella"])
     assert (tankard.classes, tankard.is_searched) == (("tankard",), True)
-    assert umbrella.warning == "no class of the detector matches 'umbrella'"
+    assert umbrella.warning == "no class of the detector matches 'umbrella'; point at it, or prompt a detector by text"
 
 
 def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):
