@@ -312,7 +312,7 @@ def _notes(options: argparse.Namespace, mapped: MappedRun) -> Iterator[str]:
     yield from mapped.mapper.notes
     if result.processed > 0 and not result.totals.region_seen:
         if options.task is not None:
-            yield "none of these frames shows an object of the task"
+            yield "found nothing of the task in these frames"
         elif has_regions(options):
             yield "none of these frames shows the selected region; check that it belongs to this sequence, in metres"
     for frame, _ in mapped.run.scheduled.schedule.switches:

@@ -87,6 +87,7 @@ def chosen_detector(perception: PerceptionSettings) -> Detector | None:
         perception.vocabulary,
         perception.threads,
         perception.accept_similar,
+        perception.min_score,
         perception.tiles,
         perception.detection_time_s,
     )
@@ -155,8 +156,7 @@ class EstimatorFactory:
         It uses the user's detector or, without any, the scene's ground truth. Raises InvalidInputError without both,
         unless a person points at all targets.
         """
-        accept_similar = self._perception.accept_similar
-        evidence = EvidenceSettings.accept_similar() if accept_similar else EvidenceSettings()
+        evidence = EvidenceSettings.accept_similar() if self._perception.accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         detector = self._detector_or_truth(bool(graph.queries))
         if self._detector is None or not self._perception.asynchronous:

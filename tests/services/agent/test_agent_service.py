@@ -63,7 +63,7 @@ def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
         assigned = a.client.assign_task("Pick up the mug on the table")
         searched, unsupported, not_seen = a.client.status().notes
     assert assigned.warnings == ("no region matches 'table'; the regions are mug_1",)
-    assert searched == "'mug' is searched as 'mug_1' (ground truth): 0 detections, best score 0.00, 0 confirmed"
+    assert searched == "'mug' is searched as 'mug_1' (ground truth): not seen so far; point at it if a frame shows it"
     assert unsupported.startswith("no region matches 'table'")
     assert not_seen.startswith("no class of the detector is a 'table': the height of what an object stands on decides")
 

@@ -1,9 +1,9 @@
-"""Detect nouns with a YOLO network of fixed classes, and segment boxes with the masks of any class."""
+"""Detect nouns with a network of fixed classes, and segment boxes with the masks of any class."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -14,10 +14,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import DetectedBox, Detection, Rival
 from gausslite.nouns import is_generic, same_kind
-from gausslite_detectors.boxes import BoxSizeLimits, box_iou
-from gausslite_detectors.class_match import ClassMatchSettings, TextEmbeddings, match_noun
+from gausslite_detectors.boxes import BoxSizeLimits, box_iou, with_unseen
+from gausslite_detectors.class_match import ClassMatchSettings, TextEmbeddings, class_nouns, match_noun
+from gausslite_detectors.class_names import names_file
 from gausslite_detectors.model_file import OpenModel
-from gausslite_detectors.yolo_network import Candidates, YoloNetwork, suppress
+from gausslite_detectors.network import Candidates, DetectionNetwork, suppress
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +50,10 @@ class ClassAgnosticSettings:
 class ClassAgnosticSegmenter:
     """A Segmenter that gives each box the mask of the instance, of any class, with the largest overlap."""
 
-    def __init__(self, network: YoloNetwork, settings: ClassAgnosticSettings | None = None) -> None:
+    def __init__(self, network: DetectionNetwork, settings: ClassAgnosticSettings | None = None) -> None:
         """Without settings, use the defaults for the network's number of classes."""
         self._network = network
-        self._settings = settings or ClassAgnosticSettings.for_classes(network.classes)
+        self._settings = settings or ClassAgnosticSettings.for_classes(network.layout.classes)
 
     def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
         """Return per box the mask with the largest box IoU; None if no IoU reaches min_box_iou."""
@@ -70,7 +71,7 @@ class ClassAgnosticSegmenter:
 
 
 @dataclass(frozen=True, slots=True)
-class YoloSettings:
+class ClassDetectorSettings:
     """Thresholds of score, overlap and size of the boxes.
 
     weak_score: lowest score of weak detections, which only named objects have. rival_min_iou: lowest
@@ -94,36 +95,40 @@ class YoloSettings:
             raise InvalidInputError(f"detector max_boxes: expected 1 to 1000, got {self.max_boxes}")
 
 
-class YoloDetector:
-    """A BoxDetector for one YOLO file with class names in its metadata; with masks also a Detector."""
+class ClassDetector:
+    """A BoxDetector for one file with class names; with masks also a Detector."""
 
     def __init__(
-        self, model: OpenModel, embeddings: TextEmbeddings | None = None, settings: YoloSettings | None = None
+        self, model: OpenModel, embeddings: TextEmbeddings | None = None, settings: ClassDetectorSettings | None = None
     ) -> None:
         """Run the model once to check its outputs. Raises ModelFileError.
 
         Without embeddings, nouns match classes only by name and by a short list of synonyms.
         """
-        self._settings = settings or YoloSettings()
+        self._settings = settings or ClassDetectorSettings()
         self._embeddings = embeddings
-        self._network = YoloNetwork(model)
-        if not self._network.names:
-            raise ModelFileError(f"model {model.path}: expected class names in the metadata field 'names', got none")
+        self._network = DetectionNetwork(model)
+        if not self._network.layout.names:
+            raise ModelFileError(
+                f"model {model.path}: expected class names in the metadata field 'names' or, one per line, in "
+                f"{names_file(model.path).name} beside it, got none"
+            )
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The names of the network's classes."""
-        return self._network.names
+        """The names of the network's classes, "" for an index without one."""
+        return self._network.layout.names
 
     @property
     def has_masks(self) -> bool:
         """True if the network has masks; without them `detect` finds nothing, and `boxes` everything."""
-        return self._network.has_masks
+        return self._network.layout.has_masks
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return the network's classes that match each query."""
         how = self._settings.class_match
-        return tuple(match_noun(query, self.class_names, self._embeddings, how) for query in queries)
+        found = (match_noun(query, self.class_names, self._embeddings, how) for query in queries)
+        return tuple(replace(match, min_score=self._settings.min_score) for match in found)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return all instances of each query with masks, best first, without boxes too large for their class."""
@@ -134,11 +139,12 @@ class YoloDetector:
         every = output.candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
         masks, overlaps = output.masks(candidates), self._overlaps(candidates, every)
-        return [
+        found = [
             Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak)
             for row, box in self._boxes(candidates, every, overlaps, query_classes, frame)
             if masks[row].any()
         ]
+        return with_unseen(found, self.best_boxes(frame, queries), frame)
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """Return the boxes of `detect` without masks."""
@@ -149,6 +155,15 @@ class YoloDetector:
         candidates = self._distinct(every, query_classes)
         overlaps = self._overlaps(candidates, every)
         return [box for _, box in self._boxes(candidates, every, overlaps, query_classes, frame)]
+
+    def best_boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
+        """Return the box of each query with the best score, below every threshold and of any size too."""
+        output, found = self._network.run(frame), []
+        for query, classes in self._query_classes(queries).items():
+            peak = output.peak(classes)
+            left, top, right, bottom = (float(edge) for edge in peak.boxes_px[0])
+            found.append(DetectedBox(query, float(peak.scores[0]), (left, top, right, bottom), is_weak=True))
+        return found
 
     def _query_classes(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
         """Return the class indices of each query that is searched."""
@@ -185,13 +200,15 @@ class YoloDetector:
                 if is_weak and is_generic(query):
                     continue
                 box = DetectedBox(query, score, (left, top, right, bottom), rival, is_weak)
-                if self._settings.box_limits.accepts(name, box.score, box.box_px, frame):
+                if self._settings.box_limits.accepts(class_nouns(name)[0], box.score, box.box_px, frame):
                     yield int(row), box
 
     def _distinct(self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]]) -> Candidates:
         """Return the candidates of the queries' classes after non-maximum suppression."""
         classes = np.unique([index for indices in query_classes.values() for index in indices]).astype(np.int64)
         candidates = candidates.take(np.flatnonzero(np.isin(candidates.classes, classes)))
+        if self._network.layout.is_final:
+            return candidates.take(np.argsort(-candidates.scores, kind="stable")[: self._settings.max_boxes])
         return suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=False)
 
     def _rival(self, query: str, classes: tuple[int, ...], overlapping: Candidates) -> Rival | None:
@@ -199,12 +216,18 @@ class YoloDetector:
         for row in np.argsort(-overlapping.scores, kind="stable"):
             index = int(overlapping.classes[row])
             name = self.class_names[index]
-            if index not in classes and not is_generic(query) and not same_kind(query, name):
+            is_other = not any(same_kind(query, noun) for noun in class_nouns(name))
+            if index not in classes and not is_generic(query) and is_other:
                 return Rival(name, float(overlapping.scores[row]))
         return None
 
 
-def load_yolo(model: OpenModel, accept_similar: bool = False) -> YoloDetector:
+def load_class_detector(
+    model: OpenModel, accept_similar: bool = False, min_score: float | None = None
+) -> ClassDetector:
     """Return the detector with the text embeddings of the model's folder. Raises ModelFileError."""
-    settings = YoloSettings(class_match=ClassMatchSettings(accept_similar=accept_similar))
-    return YoloDetector(model, TextEmbeddings.from_model_folder(model.path), settings)
+    settings = ClassDetectorSettings(class_match=ClassMatchSettings(accept_similar=accept_similar))
+    if min_score is not None:
+        weak_score = min_score * settings.weak_score / settings.min_score
+        settings = replace(settings, min_score=min_score, weak_score=weak_score)
+    return ClassDetector(model, TextEmbeddings.from_model_folder(model.path), settings)
