@@ -26,6 +26,10 @@ class RuleParser:
 
     def parse(self, text: str) -> TaskGraph:
         """Return the graph of one task. Raises TaskError."""
+        return self.parse_counting(text)[0]
+
+    def parse_counting(self, text: str) -> tuple[TaskGraph, tuple[str, ...]]:
+        """Return the graph of one task, and the nouns of the sentence that the graph lacks. Raises TaskError."""
         require_task_text(text)
         read = read_typed(text, normalise_text(text))
         tagged = tag_words(lexical_units(read.text))
@@ -37,7 +41,8 @@ class RuleParser:
         draft.warnings += [f"{comparison!r} is not understood: it is dropped" for comparison in comparisons(read.text)]
         if _loses_negation(chunks, draft):
             draft.warnings.append("a negation is not understood: it is dropped")
-        draft.warnings += [f"{noun!r} is not part of the task" for noun in lost_nouns(tagged, draft)]
+        lost = lost_nouns(tagged, draft)
+        draft.warnings += map(lost_warning, lost)
         draft.warnings += [f"{name!r} is no known noun: it may be misread" for name in unknown_names(draft)]
         parsed = ParsedPhrases(
             targets={target: draft.roles[target] for target in draft.targets},
@@ -48,7 +53,13 @@ class RuleParser:
             warnings=(*read.warnings, *draft.warnings),
             mentions=draft.mentions,
         )
-        return replace(grounded_graph(read.text, parsed, draft), task_id=task_id_of(text), text=text.strip())
+        graph = grounded_graph(read.text, parsed, draft)
+        return replace(graph, task_id=task_id_of(text), text=text.strip()), lost
+
+
+def lost_warning(noun: str) -> str:
+    """Return the warning about a noun that the graph lacks."""
+    return f"{noun!r} is not part of the task"
 
 
 def _loses_negation(chunks: list[Chunk], draft: GraphDraft) -> bool:
