@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -120,10 +120,14 @@ def _point(name: str, values: Sequence[float]) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-def _rounded(value: Any) -> Any:
+def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return JSON values with numbers of four decimals: a model reads each digit."""
+    return {key: _rounded_value(value) for key, value in values.items()}
+
+
+def _rounded_value(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _rounded(entry) for key, entry in value.items()}
+        return _rounded(value)
     if isinstance(value, list | tuple):
-        return [_rounded(entry) for entry in value]
+        return [_rounded_value(entry) for entry in value]
     return round(value, _DIGITS) if isinstance(value, float) else value

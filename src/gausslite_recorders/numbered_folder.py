@@ -12,37 +12,14 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.files import load_rgbd
-from gausslite.datasets.folder import REPAIRABLE_DEVIATION, FolderSource, Origin, is_lost
+from gausslite.datasets.folder import FolderSource, Origin, is_lost
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import Trajectory, require_rigid
+from gausslite.domain.pose import Trajectory
 
 _RATE_HZ = 30
 _ORIGIN_POSES = 9
-
-
-def nearest_rigid(location: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-    """Return the pose with the nearest exact rotation, if its own is orthonormal up to rounding (|R Rᵀ - I| <= 0.05).
-
-    Raises PoseError with the location for NaN, infinity, a wrong last row, a reflection or a larger deviation.
-    """
-    if not np.isfinite(matrix).all():
-        bad = float(matrix[~np.isfinite(matrix)][0])
-        raise PoseError(f"{location}: expected a pose of finite numbers, got {bad}")
-    R = matrix[:3, :3]
-    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(R))
-    if deviation > REPAIRABLE_DEVIATION or determinant <= 0:
-        raise PoseError(
-            f"{location}: expected a rigid pose (orthonormal rotation, determinant +1), "
-            f"got deviation {deviation:.3g} and determinant {determinant:.3g}"
-        )
-    U, _, Vt = np.linalg.svd(R)
-    T = matrix.copy()
-    T[:3, :3] = U @ Vt
-    require_rigid(location, T)
-    return T
 
 
 class NumberedFolderSource(FolderSource):

@@ -171,12 +171,14 @@ class _Writer:
     def _depth(self, image: Rendering) -> ndarray:
         units = np.rint(image.expected_depth_m() * self.depth_units)
         self.too_far += int((units > _MAX_DEPTH).any())
-        return np.where(units <= _MAX_DEPTH, units, 0).astype(np.uint16)
+        within: ndarray = np.where(units <= _MAX_DEPTH, units, 0).astype(np.uint16)
+        return within
 
 
 def _bytes(values: Float32[ndarray, "h w *c"]) -> ndarray:
     pixels = np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    image: ndarray = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    return image
 
 
 def _lens_note(views: Sequence[tuple[PosedView, Camera]]) -> str:

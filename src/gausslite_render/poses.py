@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.run_files import read_keyframe_views
-from gausslite.datasets.camera_files import COLMAP_FILE, read_colmap_camera
+from gausslite.datasets.camera_files import read_camera_file
 from gausslite.datasets.files import is_number, parse_numbers, read_lines, read_text
 from gausslite.datasets.folder import nearest_rigid, pose_from_quaternion, read_pose_rows
 from gausslite.domain.camera import Camera
@@ -122,8 +122,8 @@ def _camera(
 
 def _read_colmap(path: Path) -> list[PosedView]:
     """Read images.txt with the camera of cameras.txt beside it; poses are those of the world in the camera."""
-    stated = path.with_name(COLMAP_FILE)
-    found = read_colmap_camera(stated) if stated.is_file() else None
+    stated = path.with_name("cameras.txt")
+    found = read_camera_file(stated, 0, 0) if stated.is_file() else None
     views = []
     for location, line in read_lines(path):
         fields = line.split(maxsplit=9)

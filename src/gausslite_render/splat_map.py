@@ -123,8 +123,16 @@ def _gaussians(
     rgb: Float32[ndarray, "n 3"],
 ) -> Gaussians:
     n, positive_m = len(means_m), np.maximum(scales_m, np.finfo(np.float32).tiny)
-    columns = [np.ascontiguousarray(c, np.float32) for c in (means_m, quats_wxyz, positive_m, opacities, rgb)]
-    return Gaussians(*columns, np.zeros(n, np.bool_), np.zeros(n, np.uint32), np.full(n, NO_TARGET, np.int16))
+    return Gaussians(
+        means_m=np.ascontiguousarray(means_m, np.float32),
+        quats_wxyz=np.ascontiguousarray(quats_wxyz, np.float32),
+        scales_m=np.ascontiguousarray(positive_m, np.float32),
+        opacities=np.ascontiguousarray(opacities, np.float32),
+        rgb=np.ascontiguousarray(rgb, np.float32),
+        active=np.zeros(n, np.bool_),
+        kappa=np.zeros(n, np.uint32),
+        target=np.full(n, NO_TARGET, np.int16),
+    )
 
 
 def _of_finite(path: Path, gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"]) -> SplatMap:

@@ -19,10 +19,10 @@ from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import MAX_COORDINATE_M
-from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.relevance import Region
 
-REPAIRABLE_DEVIATION = 0.05
+_REPAIRABLE_DEVIATION = 0.05
 FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 """Upward direction of a world that a level first view defines."""
 
@@ -32,6 +32,29 @@ def is_lost(translation_m: Float64[ndarray, "3"], rotation: Float64[ndarray, "..
     return not (np.isfinite(translation_m).any() or np.isfinite(rotation).any()) or not rotation.any()
 
 
+def nearest_rigid(location: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+    """Return the pose with the nearest exact rotation, if its own is orthonormal up to rounding (|R Rᵀ - I| <= 0.05).
+
+    Raises PoseError with the location for NaN, infinity, a wrong last row, a reflection or a larger deviation.
+    """
+    if not np.isfinite(matrix).all():
+        bad = float(matrix[~np.isfinite(matrix)][0])
+        raise PoseError(f"{location}: expected a pose of finite numbers, got {bad}")
+    R = matrix[:3, :3]
+    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(R))
+    if deviation > _REPAIRABLE_DEVIATION or determinant <= 0:
+        raise PoseError(
+            f"{location}: expected a rigid pose (orthonormal rotation, determinant +1), "
+            f"got deviation {deviation:.3g} and determinant {determinant:.3g}"
+        )
+    U, _, Vt = np.linalg.svd(R)
+    T = matrix.copy()
+    T[:3, :3] = U @ Vt
+    require_rigid(location, T)
+    return T
+
+
 def pose_from_quaternion(
     location: str, translation_m: Float64[ndarray, "3"], quat_xyzw: Float64[ndarray, "4"]
 ) -> Float64[ndarray, "4 4"]:
@@ -39,7 +62,7 @@ def pose_from_quaternion(
     if not (np.isfinite(translation_m).all() and np.isfinite(quat_xyzw).all()):
         raise PoseError(f"{location}: expected a pose of finite numbers, got NaN or infinity")
     length = float(np.linalg.norm(quat_xyzw))
-    if abs(length - 1.0) > REPAIRABLE_DEVIATION:
+    if abs(length - 1.0) > _REPAIRABLE_DEVIATION:
         raise PoseError(f"{location}: expected a quaternion of length 1, got length {length:.3g}")
     x, y, z, w = quat_xyzw / length
     T = np.eye(4)

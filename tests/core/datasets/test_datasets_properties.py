@@ -10,13 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
-from gausslite.datasets.folder import estimate_up, pose_from_quaternion, slerp
+from gausslite.datasets.folder import estimate_up, nearest_rigid, pose_from_quaternion, slerp
 from gausslite.datasets.source import Source, select_frames
 from gausslite.domain.camera import Camera, back_project, project
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, require_rigid, rotation_angle_deg
-from gausslite_recorders.numbered_folder import nearest_rigid
 
 seeds = st.integers(0, 2**32 - 1)
 
