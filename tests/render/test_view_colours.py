@@ -132,7 +132,7 @@ def test_spz_and_splat_files_give_the_images_of_their_map(tmp_path: Path) -> Non
 
 
 def hostile_spz(count: int, payload: bytes) -> bytes:
-    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 2, count, 0, 12, 0, 0) + payload)
+    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 2, count, 0, 12, 0, 0) + payload, mtime=0)
 
 
 @pytest.mark.parametrize(

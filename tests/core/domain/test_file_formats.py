@@ -27,7 +27,7 @@ def tar() -> bytes:
     [
         (POINTER, "a Git LFS pointer"),
         (b"\n<!DOCTYPE html>", "a web page"),
-        (gzip.compress(b"x"), "a gzip archive; unpack it first"),
+        (gzip.compress(b"x", mtime=0), "a gzip archive; unpack it first"),
         (tar(), "a tar archive; unpack it first"),
         (b"\x89PNG\r\n\x1a\n", "a PNG image"),
     ],
