@@ -182,7 +182,9 @@ def _query_layout(outputs: Outputs) -> Layout | None:
     is_hugging_face = bool(outputs.named("logits")) and classes != len(names_of({}, 91))
     fit = ImageFit.STRETCH if is_hugging_face else ImageFit.NORMALISE
     family = ModelFamily.RT_DETR if is_hugging_face else ModelFamily.RF_DETR
-    return Layout(family, names, classes, bool(maps), fit, True, decode)
+    return Layout(
+        family=family, names=names, classes=classes, has_masks=bool(maps), fit=fit, is_final=True, decode=decode
+    )
 
 
 def _labelled_layout(outputs: Outputs) -> Layout | None:
@@ -210,7 +212,9 @@ def _labelled_layout(outputs: Outputs) -> Layout | None:
 
     fit = ImageFit.LETTERBOX if counts else ImageFit.STRETCH
     family = ModelFamily.YOLO_BOXES if counts else ModelFamily.RT_DETR
-    return Layout(family, names, classes, bool(maps), fit, True, decode)
+    return Layout(
+        family=family, names=names, classes=classes, has_masks=bool(maps), fit=fit, is_final=True, decode=decode
+    )
 
 
 def _yolo_layout(outputs: Outputs) -> Layout | None:
@@ -228,9 +232,14 @@ def _yolo_layout(outputs: Outputs) -> Layout | None:
     if stated and _is_listed(outputs, outputs.arrays[table], k):
         classes = class_count(stated)
         return Layout(
-            family, names_of(stated, classes), classes, bool(maps), ImageFit.LETTERBOX, True,
-            lambda arrays: _listed(arrays[table].astype(np.float32), prototypes(arrays), classes),
-        )  # fmt: skip
+            family=family,
+            names=names_of(stated, classes),
+            classes=classes,
+            has_masks=bool(maps),
+            fit=ImageFit.LETTERBOX,
+            is_final=True,
+            decode=lambda arrays: _listed(arrays[table].astype(np.float32), prototypes(arrays), classes),
+        )
     found = _classes_of_rows(outputs.arrays[table].shape, k, stated)
     if found is None:
         return None
@@ -241,7 +250,15 @@ def _yolo_layout(outputs: Outputs) -> Layout | None:
         return anchors_reading(rows.T if is_transposed else rows, classes, prototypes(arrays))
 
     names = names_of(stated, classes)
-    return Layout(family, names, classes, bool(maps), ImageFit.LETTERBOX, False, decode)
+    return Layout(
+        family=family,
+        names=names,
+        classes=classes,
+        has_masks=bool(maps),
+        fit=ImageFit.LETTERBOX,
+        is_final=False,
+        decode=decode,
+    )
 
 
 def _is_listed(outputs: Outputs, table: Array, k: int) -> bool:
@@ -287,7 +304,16 @@ def _single(
     for row in np.argsort(scores, kind="stable"):
         if classes[row] < count:
             peak_rows[classes[row]], peak_scores[classes[row]] = row, scores[row]
-    return Reading(boxes, rows, classes, scores, coefficients, masks, peak_rows, peak_scores)
+    return Reading(
+        boxes=boxes,
+        rows=rows,
+        classes=classes,
+        scores=scores,
+        coefficients=coefficients,
+        masks=masks,
+        peak_rows=peak_rows,
+        peak_scores=peak_scores,
+    )
 
 
 def anchors_reading(output: Float32[ndarray, "r a"], classes: int, prototypes: Float32[ndarray, "k h w"]) -> Reading:

@@ -234,7 +234,16 @@ class ImageInput:
         batch = shape[0] if isinstance(shape[0], int) else 1
         size = sizes[0].name if sizes else None
         kind = _TYPES[images[0].type]
-        return cls(images[0].name, size, kind, size_kind, batch, has_channels_last, height_px, width_px)
+        return cls(
+            image=images[0].name,
+            size=size,
+            kind=kind,
+            size_kind=size_kind,
+            batch=batch,
+            has_channels_last=has_channels_last,
+            height_px=height_px,
+            width_px=width_px,
+        )
 
     def feed(self, tensor: Float32[ndarray, "1 3 H W"]) -> dict[str, Any]:
         """Return the inputs for one image, which fills the batch."""

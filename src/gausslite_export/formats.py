@@ -124,7 +124,16 @@ def read_map(
         )
     total = len(stored.gaussians) + stored.left_out
     kept = harmonics if harmonics.any() else None
-    return MapContent(gaussians, chosen, total - len(gaussians), notes, stored.world_frame, views, report, kept)
+    return MapContent(
+        gaussians=gaussians,
+        chosen=chosen,
+        left_out=total - len(gaussians),
+        notes=notes,
+        world_frame=stored.world_frame,
+        views=views,
+        report=report,
+        harmonics=kept,
+    )
 
 
 def upright(content: MapContent) -> MapContent:

@@ -13,10 +13,11 @@ from gausslite_language.lexicon import singular
 from gausslite_language.spelling import is_in_dictionary
 from gausslite_language.tags import Tag, is_english
 
-_NO_OBJECTS: Final = frozenset({"one", "ones"}).union(
-    lexicon.ADDRESSEES, lexicon.TASK_NOUNS, lexicon.PLACES, lexicon.MEASURES, lexicon.ROUTES, lexicon.BODY_PARTS,
-    lexicon.MANNER_NOUNS, lexicon.TIME_NOUNS, lexicon.DEFECTS,
-)  # fmt: skip
+_NO_NAMES: Final = (
+    *(lexicon.ADDRESSEES, lexicon.TASK_NOUNS, lexicon.PLACES, lexicon.MEASURES, lexicon.ROUTES, lexicon.BODY_PARTS),
+    *(lexicon.MANNER_NOUNS, lexicon.TIME_NOUNS, lexicon.DEFECTS),
+)
+_NO_OBJECTS: Final = frozenset({"one", "ones"}).union(*_NO_NAMES)
 _PREDICATES: Final = frozenset({Tag.VERB, Tag.AUXILIARY, Tag.PARTICIPLE})
 _BEFORE_STATES: Final = frozenset({Tag.AUXILIARY, Tag.PRONOUN})
 

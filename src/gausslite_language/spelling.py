@@ -33,8 +33,12 @@ def read_typed(text: str, normalised: str) -> Reading:
     """Return the reading of a normalised text. Words with a capital inside the original text are names, and stay."""
     names = {name.casefold() for name in _NAME.findall(text)}
     plain = _SHORT_FORM.sub(lambda match: _SHORT_FORMS[match[0]], normalised)
-    unknown = (word for word in dict.fromkeys(_WORD.findall(plain)) if word not in names and not is_english(word))
+    words = dict.fromkeys(_WORD.findall(plain))
+    unknown = [word for word in words if word not in names and not is_english(word)]
     corrected = {word: nearest for word in unknown if (nearest := nearest_word(word)) is not None}
+    # a text of strange words is not English with typing errors
+    if len(unknown) - len(corrected) > len(words) - len(unknown):
+        corrected = {}
     if corrected:
         plain = _WORD.sub(lambda match: corrected.get(match[0], match[0]), plain)
     return Reading(plain, tuple(f"{word!r} is read as {nearest!r}" for word, nearest in corrected.items()))

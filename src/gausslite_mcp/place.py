@@ -177,10 +177,10 @@ def open_place(place: str, tls: Tls | None = None, threads: int | None = None) -
 
 def find_object(objects: MappedObjects, name: str) -> TeamObject:
     """Return the object of an id, or the most confident one of a noun. Raises InvalidInputError, which lists ids."""
-    found = [each for each in objects.objects if each.landmark.object_id == name]
-    found = found or [each for each in objects.objects if each.landmark.noun == name]
+    found = [known_object for known_object in objects.objects if known_object.landmark.object_id == name]
+    found = found or [known_object for known_object in objects.objects if known_object.landmark.noun == name]
     if not found:
-        known = ", ".join(each.landmark.object_id for each in objects.objects[:20]) or "none"
+        known = ", ".join(known_object.landmark.object_id for known_object in objects.objects[:20]) or "none"
         raise InvalidInputError(f"object: expected the id or the noun of an object, got {name[:80]!r}; ids are {known}")
     return max(found, key=lambda each: each.landmark.confidence)
 

@@ -1,4 +1,4 @@
-"""What a language model may ask of a place: each tool's answer as JSON values or an image."""
+"""What a language model may ask of a place: other tool's answer as JSON values or an image."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PlaceTools:
         """Return an object with the ids that it is near, on and under."""
         objects = self.place.objects()
         found = find_object(objects, name)
-        others = [each.landmark for each in objects.objects]
+        others = [other.landmark for other in objects.objects]
         relations = relations_of(found.landmark, others, objects.up_axis)
         return _rounded({"object": as_json(found, objects.box(found)), **relations})
 
@@ -121,7 +121,7 @@ def _point(name: str, values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return JSON values with numbers of four decimals: a model reads each digit."""
+    """Return JSON values with numbers of four decimals: a model reads other digit."""
     return {key: _rounded_value(value) for key, value in values.items()}
 
 

@@ -83,13 +83,13 @@ def chosen_detector(perception: PerceptionSettings) -> Detector | None:
     if perception.model is None:
         return None
     options = DetectorOptions(
-        perception.segmenter,
-        perception.vocabulary,
-        perception.threads,
-        perception.accept_similar,
-        perception.min_score,
-        perception.tiles,
-        perception.detection_time_s,
+        segmenter=perception.segmenter,
+        vocabulary=perception.vocabulary,
+        threads=perception.threads,
+        accept_similar=perception.accept_similar,
+        min_score=perception.min_score,
+        tiles_per_side=perception.tiles,
+        time_limit_s=perception.detection_time_s,
     )
     return open_detector(perception.model, options)
 

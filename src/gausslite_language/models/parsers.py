@@ -305,7 +305,7 @@ def _with_lost_targets(graph: TaskGraph, lost: Sequence[str], answer: TaskGraph)
         graph,
         targets=(*graph.targets, *added),
         roles=(*graph.roles, *(roles[name] for name in added)),
-        attributes=(*graph.attributes, *(each for each in answer.attributes if each.name in added)),
+        attributes=(*graph.attributes, *(attribute for attribute in answer.attributes if attribute.name in added)),
         warnings=(*(warning for warning in graph.warnings if warning not in solved), *marks)[: LIMITS.max_warnings],
     )
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from signals import hangup
 from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes
 
 from gausslite.cli import map_command
@@ -29,7 +30,9 @@ def mapped(sequence: Path, out: Path, *more: str) -> int:
     return main(["map", str(sequence), *WITHOUT_ESTIMATES, *region, "--out", str(out), *more])
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 143, marks=hangup)]
+)
 def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
     number: signal.Signals,
     code: int,

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from plugin_entries import register
+from signals import hangup
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
@@ -295,7 +296,7 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
         assert p.wait(30) == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=hangup)])
 def test_received_frames_give_a_map_and_a_report_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
     address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
