@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
     "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
     "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
+    "gausslite_objects": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,23 +12,27 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.json import object_as_json, object_from_json
+from gausslite.codec.json import object_as_json
 from gausslite.codec.ply import read_ply
+from gausslite.codec.run_files import read_keyframe_views
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build
 from gausslite.config.program import add_flags
 from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import Answer, ObjectReport, OrientedBox, TeamObject, oriented_box
+from gausslite.domain.objects import Answer, ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
-from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
+from gausslite.mission.results import MAP, TRAJECTORY, as_text, read_report, stated_up
 from gausslite.plugins import Group, load
 from gausslite.wire.security import TlsFiles
 from gausslite_language.rules import RuleParser
+from gausslite_objects.edit_command import reported_objects
+from gausslite_objects.edits import EditedObjects, apply_edits, read_edits
+from gausslite_objects.life import Life, LifeState, life_of
+from gausslite_objects.visit import Visit, depth_views, read_depths
 
 _NS_PER_S = 1e9
 _EPOCH_TIMES_S = 1e8
@@ -56,12 +59,12 @@ def configure(parser: CommandParser) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """The objects of a map, with notes; of a folder also its Gaussians and last camera pose, None if it has none."""
+    """The objects of a map, with notes; of a folder also their lives and edits, and its last camera pose."""
 
     objects: Sequence[TeamObject]
     up_axis: UpAxis = (0.0, 0.0, 1.0)
-    targets: tuple[str, ...] = ()
-    gaussians: Gaussians | None = None
+    lives: Mapping[str, Life] = field(default_factory=dict)
+    edited: EditedObjects = field(default_factory=lambda: apply_edits((), ()))
     T_world_camera: Float64[ndarray, "4 4"] | None = None
     notes: tuple[str, ...] = ()
 
@@ -72,16 +75,12 @@ def run(options: argparse.Namespace) -> int:
     place = _read_folder(folder) if folder.is_dir() else _query(options)
     objects, notes = _select(place, options.question)
     notes = (*notes, *place.notes)
-    boxes = [
-        None if place.gaussians is None else oriented_box(found.landmark, place.gaussians, place.targets, place.up_axis)
-        for found in objects
-    ]
     if options.json:
-        values = [_as_json(*pair) for pair in zip(objects, boxes, strict=True)]
+        values = [_as_json(found, place) for found in objects]
         print(as_text({"count": len(objects), "objects": values, "notes": list(notes)}))
     else:
-        for pair in zip(objects, boxes, strict=True):
-            print(_describe(*pair))
+        for found in objects:
+            print(_describe(found, place))
         for note in notes:
             print(f"note: {note}")
         if options.question or not objects:
@@ -126,27 +125,35 @@ def _query(options: argparse.Namespace) -> _Place:
 
 def _read_folder(folder: Path) -> _Place:
     """Return the objects in report.json, with what the folder has of the map. Raises InvalidInputError, CodecError."""
-    report = read_report(folder)
-    values = report.get("objects")
-    if not isinstance(values, list):
-        raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
+    report, edited = read_report(folder), apply_edits(reported_objects(folder), read_edits(folder))
     agent_id = str(report.get("agent_id") or folder.resolve().name)
     targets = report.get("targets")
     nouns = tuple(str(target) for target in targets) if isinstance(targets, list) else ()
     graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
-    objects = merge_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))})
-    map_file, trajectory = folder / "map.ply", folder / TRAJECTORY
+    objects = merge_objects({agent_id: ObjectReport(graph, edited.objects)})
+    trajectory = folder / TRAJECTORY
     poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
     return _Place(
         objects,
         stated_up(report) or upward_axis(poses),
-        nouns,
-        read_ply(map_file) if map_file.is_file() else None,
+        _lives(folder, edited.objects),
+        edited,
         poses[-1] if len(poses) else None,
     )
 
 
-def _as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, object]:
+def _lives(folder: Path, objects: Sequence[ObjectLandmark]) -> dict[str, Life]:
+    """Return what the run's own depth says of each object by id; empty for a folder without a map or depth."""
+    keyframes = read_keyframe_views(folder)
+    depths_m = read_depths(folder, keyframes)
+    if not depths_m or not (folder / MAP).is_file():
+        return {}
+    views, times_ns = depth_views(keyframes, depths_m)
+    visit = Visit(read_ply(folder / MAP), objects, views, times_ns)
+    return {found.object_id: life_of(visit.points_of(found), views, times_ns) for found in objects}
+
+
+def _as_json(team_object: TeamObject, place: _Place) -> dict[str, object]:
     observers = [
         {
             "agent_id": observer.agent_id,
@@ -158,23 +165,39 @@ def _as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, obje
         }
         for observer in team_object.observers
     ]
-    oriented = {} if box is None else {"yaw_rad": box.yaw_rad, "oriented_size_m": list(box.size_m)}
-    return {**object_as_json(team_object.landmark), **oriented, "observers": observers}
-
-
-def _describe(team_object: TeamObject, box: OrientedBox | None) -> str:
     landmark = team_object.landmark
-    place = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
-    size = " x ".join(f"{value:.2f}" for value in (landmark.size_m if box is None else box.size_m))
-    turned = "" if box is None else f" turned by {round(math.degrees(box.yaw_rad))} deg"
+    life = place.lives.get(landmark.object_id)
+    edited = {
+        "life": None if life is None else life.as_json(),
+        "pinned": landmark.object_id in place.edited.pinned,
+        "notes": list(place.edited.notes.get(landmark.object_id, ())),
+    }
+    return {**object_as_json(landmark), **edited, "observers": observers}
+
+
+def _describe(team_object: TeamObject, place: _Place) -> str:
+    landmark = team_object.landmark
+    centre = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
+    size = " x ".join(f"{value:.2f}" for value in landmark.size_m)
     seen = "; ".join(
         f"{observer.agent_id} {_span(_time(observer.first_seen_ns), _time(observer.last_seen_ns))}"
         for observer in team_object.observers
     )
     return (
-        f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({place}) m, size {size} m{turned}, "
-        f"confidence {landmark.confidence:.2f}, seen by {seen}"
+        f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({centre}) m, size {size} m, "
+        f"confidence {landmark.confidence:.2f}, seen by {seen}{_state(landmark, place)}"
     )
+
+
+def _state(landmark: ObjectLandmark, place: _Place) -> str:
+    """Return what the views and people say of an object, after a comma; empty for one that is just present."""
+    life = place.lives.get(landmark.object_id)
+    parts = [] if life is None or life.state is LifeState.PRESENT else [str(life.state)]
+    if life is not None and life.absent_ns is not None:
+        parts.append(f"its place last seen empty at {_time(life.absent_ns)}")
+    parts += ["pinned"] if landmark.object_id in place.edited.pinned else []
+    parts += [f"note of {note}" for note in place.edited.notes.get(landmark.object_id, ())]
+    return "".join(f", {part}" for part in parts)
 
 
 def _span(first: str, last: str) -> str:
