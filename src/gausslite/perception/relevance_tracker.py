@@ -63,7 +63,6 @@ class RelevanceTracker:
         self._targets = TargetSelector(graph, NamedObjects(self._object_map, self._evidence, self._selector))
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
-        self._needs_observation = False
         self._known_targets: list[int] = []
         self._seen: dict[str, tuple[int, float, int]] = {}  # detections of a noun, its best score, in which frame
 
@@ -86,7 +85,8 @@ class RelevanceTracker:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task by their roles, the most confident first."""
         confirmed = self._evidence.confirmed(self.landmarks)
-        kept = (found for found in confirmed if not self._targets.is_excluded(found))
+        witnessed = filter(self._evidence.is_witnessed, confirmed)
+        kept = (found for found in witnessed if not self._targets.is_excluded(found))
         return describe_landmarks([(found, self._targets.role(found)) for found in kept])
 
     def report(self, match: NounMatch) -> NounReport:
@@ -101,7 +101,7 @@ class RelevanceTracker:
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
-            "keyframe_age": int_array(self._frames_since, self._needs_observation),
+            "keyframe_age": int_array(self._frames_since),
             "known_targets": int_array(*self._known_targets),
         }
         state |= self._selector.state()
@@ -130,8 +130,7 @@ class RelevanceTracker:
         self._selector.restore(state)
         self._object_map.restore([decode_landmark(saved, self._selector.decode(saved)) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
-        self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
-        self._needs_observation = needs_observation > 0
+        (self._frames_since,) = get_counts(state, "keyframe_age", 1)
         self._known_targets = list(get_counts(state, "known_targets", len(state.get("known_targets", ()))))
 
     def point_at(self, noun: str, mask: Bool[ndarray, "h w"], frame: Frame) -> None:
@@ -160,15 +159,13 @@ class RelevanceTracker:
     def update_keyframe(self, frame: Frame) -> bool:
         """Return whether this frame needs a detection, and make it the keyframe if so.
 
-        Keyframes are the first frame, every max_frames-th frame, a frame far from the keyframe, and the frame after a
-        detection whose target needs another observation.
+        Keyframes are the first frame, every max_frames-th frame, and a frame far from the keyframe.
         """
         T_world_keyframe = self._T_world_keyframe
         self._frames_since += 1
         is_keyframe = (
             T_world_keyframe is None
             or self._frames_since >= self._settings.max_frames
-            or (self._needs_observation and self._frames_since == 1)
             or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
             or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
         )
@@ -239,16 +236,11 @@ class RelevanceTracker:
         self._selector.observe(frame)
         visibility = VisibilityCheck(frame, frame.depth_m)
         self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
-        shown = [
-            (landmark, detection.mask, observation)
+        return [
+            (landmark, detection.mask)
             for detection, observation in localised
             if (landmark := self._object_map.match(observation)) is not None
         ]
-        self._needs_observation = any(
-            self._evidence.needs_observation(landmark) and self._targets.target_of(observation) is not None
-            for landmark, _, observation in shown
-        )
-        return [(landmark, mask) for landmark, mask, _ in shown]
 
     def _measured(
         self, lifted: Sequence[tuple[Detection, Observation]], frame: Frame
@@ -308,6 +300,8 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "seen_missed": int_array(landmark.seen_count, landmark.missed_count, landmark.missed_in_a_row),
         "weak_given": int_array(landmark.weak_count, landmark.is_given),
         "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
+        "views": np.array([landmark.view_count, landmark.view_ns], np.int64),
+        "view_camera_m": np.zeros((0, 3)) if landmark.view_camera_m is None else landmark.view_camera_m[None],
         "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
         "rival_names": encode_text("\n".join(landmark.rival_scores)),
         "vote_keys": landmark.votes.keys,
@@ -331,6 +325,8 @@ def decode_landmark(state: State, measured: Measured | None) -> Landmark:
     weak_count, is_given = get_counts(state, "weak_given", 2)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
+    view_count, view_ns = (int(value) for value in get_array(state, "views", (2,), np.int64))
+    view_camera_m = next(iter(get_array(state, "view_camera_m", (None, 3), np.float64).copy()), None)
     keys = get_array(state, "vote_keys", (None,), np.int64).copy()
     inside, outside = get_array(state, "votes", (2, len(keys)), np.int64).copy()
     if (keys[1:] <= keys[:-1]).any() or (inside < 0).any() or (outside < 0).any():
@@ -353,6 +349,9 @@ def decode_landmark(state: State, measured: Measured | None) -> Landmark:
         first_seen_ns=first_ns,
         last_seen_ns=last_ns,
         number=number,
+        view_count=view_count,
+        view_camera_m=view_camera_m,
+        view_ns=view_ns,
         score_sum=score_sum,
         rival_scores=dict(zip(names, rival_sums, strict=True)),
         votes=SurfaceVotes(keys, inside, outside, voxel_m),

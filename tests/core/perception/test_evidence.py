@@ -27,7 +27,7 @@ def frame_at(x_m: float = 0.0, index: int = 0, wall_m: float = 2.0) -> Frame:
     T_world_camera = np.eye(4)
     T_world_camera[0, 3] = x_m
     depth_m = np.full((120, 160), wall_m, np.float32)
-    return Frame(index, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
+    return Frame(index, index * 10**9, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
 
 
 def landmark_at(z_m: float = 2.0, score: float = 0.4) -> Landmark:
@@ -69,14 +69,21 @@ def test_low_scores_need_two_detections_and_high_scores_one():
     assert target_marked([0.4, None], 3) == [False, False, False]
 
 
-def test_a_first_low_score_makes_the_next_frame_a_keyframe():
-    assert target_marked([0.4], 6, max_frames=5) == [False, True, True, True, True, True]
-    no_detection, low_score = ScriptedDetector([None]), ScriptedDetector([0.4, None])
-    for detector, calls in ((no_detection, 1), (low_score, 2)):
-        estimator = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
-        for index in range(5):
-            estimator.estimate(frame_at(index=index))
-        assert detector.calls == calls
+def test_a_second_detection_of_the_same_moment_and_place_confirms_nothing():
+    evidence = Evidence(EvidenceSettings())
+    for time_ns, camera_m, is_witnessed in (
+        (200_000_000, (0.05, 0.0, 0.0), False),
+        (200_000_000, (0.2, 0.0, 0.0), True),
+        (1_000_000_000, (0.0, 0.0, 0.0), True),
+    ):
+        for score in (0.4, 0.75):
+            landmark = landmark_at(score=score)
+            again = landmark_at(score=score)
+            again.view_ns, again.view_camera_m = time_ns, np.array(camera_m)
+            landmark.add(again)
+            assert evidence.is_witnessed(landmark) is is_witnessed
+            assert (evidence.state(landmark) is LandmarkState.CANDIDATE) is (score < 0.6 and not is_witnessed)
+    assert evidence.is_witnessed(landmark_at(score=1.0))
 
 
 def test_a_target_survives_one_missed_detection_for_each_that_found_it():
