@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.codec.json import object_as_json
 from gausslite.codec.ply import read_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.datasets.folder import read_pose_rows
@@ -106,7 +107,7 @@ def as_json(team_object: TeamObject, place: MappedObjects) -> dict[str, object]:
         "pinned": landmark.object_id in place.edited.pinned,
         "notes": list(place.edited.notes.get(landmark.object_id, ())),
     }
-    return {**objectas_json(landmark), **edited, "observers": observers}
+    return {**object_as_json(landmark), **edited, "observers": observers}
 
 
 def _lives(folder: Path, objects: Sequence[ObjectLandmark]) -> dict[str, Life]:
