@@ -62,7 +62,7 @@ def test_a_pinned_object_stays_and_merged_ones_are_one(run: Path) -> None:
     edited = _edited(run)
     assert ([found.centroid_m for found in edited.objects], len(edited.pinned)) == ([FOUND.centroid_m], 1)
     assert _edited(run, FOUND).objects == (FOUND,)
-    half = replace(FOUND, object_id="mug-2").moved(transform_of(np.eye(3), [5.0, 5.0, 5.0]))
+    half = replace(FOUND, object_id="mug-2").moved(transform_of(np.array([5.0, 5.0, 5.0, 0.0, 0.0, 0.0])))
     merge = Edit(EditKind.MERGE, "ann", 1, FOUND, half.object_id, half)
     [merged] = apply_edits([FOUND, replace(half, confidence=1.0)], [merge]).objects
     assert (merged.object_id, merged.confidence) == (FOUND.object_id, 1.0)

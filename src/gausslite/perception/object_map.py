@@ -262,11 +262,17 @@ class Landmark:
         return bool(inside.all())
 
     def box_m(self) -> AxisAlignedBox:
-        """Return the axis-aligned box of the surface on which the masks agree, or of the footprint's cells."""
-        if self.votes.box is not None:
-            return self.votes.box
-        centres_m, half_m = self.footprint_m().astype(np.float64), 0.5 * CELL_M
-        return AxisAlignedBox.around(np.vstack([centres_m - half_m, centres_m + half_m]))
+        """Return the axis-aligned box of the surface on which the masks agree, or of the footprint's cells.
+
+        It contains no place that another noun's masks claim too: such places have votes, but no cells.
+        """
+        surface, half_m = self.votes.box, 0.5 * CELL_M
+        cells_m = self.footprint_m() if surface is None else VoxelGrid(CELL_M).centres_m(self.cells)
+        low_m, high_m = cells_m.min(axis=0) - half_m, cells_m.max(axis=0) + half_m
+        corners_m = np.stack([low_m, high_m]).astype(np.float64)
+        if surface is not None:
+            corners_m = np.clip(np.array([surface.min_m, surface.max_m]), *corners_m)
+        return AxisAlignedBox.around(corners_m)
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Return the centres of the cells that are observed often, or of all cells if those are few."""
