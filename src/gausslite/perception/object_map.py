@@ -30,7 +30,7 @@ _MIN_COUNT_SHARE = 0.15
 """Observations of a cell, relative to the often observed ones, above which it belongs to the footprint."""
 _MIN_FOOTPRINT_SHARE = 0.25
 """Share of the cells that a footprint has; below, all cells count."""
-_INDEPENDENT_NS, _INDEPENDENT_M = 1_000_000_000, 0.1
+INDEPENDENT_NS, _INDEPENDENT_M = 1_000_000_000, 0.1
 """Time or motion of the camera from which a further observation is independent."""
 _MAX_CELLS = 4000
 MAX_OBJECTS = 500
@@ -235,7 +235,7 @@ class Landmark:
 
     def _is_independent_of(self, other: Landmark) -> bool:
         """Return True if another time or viewpoint shows it: two images of one moment err alike."""
-        if abs(other.view_ns - self.view_ns) >= _INDEPENDENT_NS or other.view_camera_m is None:
+        if abs(other.view_ns - self.view_ns) >= INDEPENDENT_NS or other.view_camera_m is None:
             return True
         baseline_m = 0.0 if self.view_camera_m is None else np.linalg.norm(other.view_camera_m - self.view_camera_m)
         return bool(baseline_m >= _INDEPENDENT_M)

@@ -32,7 +32,15 @@ from gausslite.nouns import is_generic
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
-from gausslite.perception.object_map import MAX_OBJECTS, Landmark, Measured, ObjectMap, Observation, describe_landmarks
+from gausslite.perception.object_map import (
+    INDEPENDENT_NS,
+    MAX_OBJECTS,
+    Landmark,
+    Measured,
+    ObjectMap,
+    Observation,
+    describe_landmarks,
+)
 from gausslite.perception.relations import NamedObjects
 from gausslite.perception.selector import open_selector
 from gausslite.perception.settings import RelevanceTrackerSettings
@@ -62,7 +70,8 @@ class RelevanceTracker:
         self._selector = open_selector(graph, matches, up)
         self._targets = TargetSelector(graph, NamedObjects(self._object_map, self._evidence, self._selector))
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
-        self._frames_since = 0
+        self._frames_since, self._keyframe_ns = 0, 0
+        self._needs_observation = False
         self._known_targets: list[int] = []
         self._seen: dict[str, tuple[int, float, int]] = {}  # detections of a noun, its best score, in which frame
 
@@ -101,7 +110,7 @@ class RelevanceTracker:
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
-            "keyframe_age": int_array(self._frames_since),
+            "keyframe_age": int_array(self._frames_since, self._keyframe_ns, self._needs_observation),
             "known_targets": int_array(*self._known_targets),
         }
         state |= self._selector.state()
@@ -130,7 +139,8 @@ class RelevanceTracker:
         self._selector.restore(state)
         self._object_map.restore([decode_landmark(saved, self._selector.decode(saved)) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
-        (self._frames_since,) = get_counts(state, "keyframe_age", 1)
+        self._frames_since, self._keyframe_ns, needs_observation = get_counts(state, "keyframe_age", 3)
+        self._needs_observation = needs_observation > 0
         self._known_targets = list(get_counts(state, "known_targets", len(state.get("known_targets", ()))))
 
     def point_at(self, noun: str, mask: Bool[ndarray, "h w"], frame: Frame) -> None:
@@ -159,18 +169,21 @@ class RelevanceTracker:
     def update_keyframe(self, frame: Frame) -> bool:
         """Return whether this frame needs a detection, and make it the keyframe if so.
 
-        Keyframes are the first frame, every max_frames-th frame, and a frame far from the keyframe.
+        Keyframes are the first frame, every max_frames-th frame, a frame far from the keyframe, and the first one that
+        is another witness of a target that the keyframe shows.
         """
         T_world_keyframe = self._T_world_keyframe
         self._frames_since += 1
         is_keyframe = (
             T_world_keyframe is None
             or self._frames_since >= self._settings.max_frames
+            or (self._needs_observation and frame.capture_time_ns - self._keyframe_ns >= INDEPENDENT_NS)
             or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
             or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
         )
         if is_keyframe:
             self._T_world_keyframe, self._frames_since = frame.T_world_camera, 0
+            self._keyframe_ns = frame.capture_time_ns
         return is_keyframe
 
     def integrate(
@@ -236,11 +249,16 @@ class RelevanceTracker:
         self._selector.observe(frame)
         visibility = VisibilityCheck(frame, frame.depth_m)
         self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
-        return [
-            (landmark, detection.mask)
+        shown = [
+            (landmark, detection.mask, observation)
             for detection, observation in localised
             if (landmark := self._object_map.match(observation)) is not None
         ]
+        self._needs_observation = any(
+            not self._evidence.is_witnessed(landmark) and self._targets.target_of(observation) is not None
+            for landmark, _, observation in shown
+        )
+        return [(landmark, mask) for landmark, mask, _ in shown]
 
     def _measured(
         self, lifted: Sequence[tuple[Detection, Observation]], frame: Frame
