@@ -35,6 +35,7 @@ class Group(StrEnum):
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
+    MONITORS = "gausslite.monitors"  # judges whether a robot is where its odometry says, and finds a lost one
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments

@@ -16,6 +16,8 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
 from gausslite.mapping.tracking import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.mission.localisation_monitor import LocalisationMonitor
+from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.settings import LoopMode, MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.detector import Detector, RegionDetector
@@ -28,12 +30,14 @@ from gausslite.perception.relevance import (
     TaskRelevanceEstimator,
 )
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
-from gausslite.plugins import Group, load
+from gausslite.plugins import Group, find, load
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
+OpenMonitor = Callable[[PriorMap | None], LocalisationMonitor]
+"""The plug-in of `gausslite.monitors`, for a mission that continues an earlier map, or begins its own."""
 
 
 def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> GaussianMapper:
@@ -68,6 +72,12 @@ def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTr
     return CameraTracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
+def open_monitor(settings: MissionSettings, prior: PriorMap | None = None) -> LocalisationMonitor | None:
+    """Return what judges the place of each frame; None where the camera is tracked, or if none is installed."""
+    open_plugin: OpenMonitor | None = find(Group.MONITORS)
+    return None if open_plugin is None or settings.poses is PoseMode.TRACK else open_plugin(prior)
+
+
 def chosen_detector(perception: PerceptionSettings) -> Detector | None:
     """Open the user's detector file; None without one. Raises ModelFileError, InvalidInputError, MissingPluginError."""
     if perception.model is None:
@@ -92,16 +102,17 @@ def build_task_mapper(
     settings: MissionSettings,
     estimators: EstimatorFactory,
     roi: TaskGraph | Sequence[Region],
-    prior: Gaussians | None = None,
+    earlier: Gaussians | None = None,
+    monitor: LocalisationMonitor | None = None,
 ) -> TaskMapper:
     """Return a mapper of an empty map, or of an earlier one. roi: a task, or regions of space; neither: uniform.
 
     Raises KernelError, QuotaError, and InvalidInputError for a task without a detector.
     """
     estimator = estimators.build(roi) if isinstance(roi, TaskGraph) else region_estimator(roi)
-    mapper = build_mapper(settings, prior)
-    scheduler = FrameScheduler(settings.scheduler_settings)
-    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=build_tracker(settings, mapper))
+    mapper = build_mapper(settings, earlier)
+    scheduler, tracker = FrameScheduler(settings.scheduler_settings), build_tracker(settings, mapper)
+    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=tracker, monitor=monitor)
 
 
 class EstimatorFactory:
