@@ -11,8 +11,8 @@ import pytest
 from support import shape_checks
 from support.postgres_running import PostgresServer, postgres_server
 
-WITH_SHAPES = "api codec datasets domain fusion mapping mission perception pose_fit render wire"
-BESIDE_THE_CORE = "bench calibration detectors evaluation export places selection sim"
+WITH_SHAPES = "api codec datasets domain fusion mapping mission perception render wire"
+BESIDE_THE_CORE = "bench calibration detectors evaluation export mcp places poses refinement render selection sim"
 shape_checks.install(
     [f"gausslite.{name}" for name in WITH_SHAPES.split()] + [f"gausslite_{name}" for name in BESIDE_THE_CORE.split()]
 )

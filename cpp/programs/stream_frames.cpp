@@ -25,6 +25,7 @@ namespace {
 namespace fs = std::filesystem;
 namespace pb = gausslite::v1;
 constexpr std::int64_t frame_interval_ns = 33'333'333;
+constexpr int keepalive_ms = 15'000;
 
 std::string read_file(const fs::path& path) {
     std::ifstream file(path, std::ios::binary);
@@ -139,8 +140,13 @@ int main(int count, char** arguments) try {
         std::fprintf(stderr, "usage: gausslite_stream_frames HOST:PORT FOLDER \"TASK\"\n");
         return 2;
     }
-    const auto stub =
-        pb::AgentService::NewStub(grpc::CreateChannel(arguments[1], grpc::InsecureChannelCredentials()));
+    // else a half-open connection would wait for the system's timeout, which is many minutes
+    grpc::ChannelArguments pings;
+    pings.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, keepalive_ms);
+    pings.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, keepalive_ms);
+    pings.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
+    const auto stub = pb::AgentService::NewStub(
+        grpc::CreateCustomChannel(arguments[1], grpc::InsecureChannelCredentials(), pings));
     pb::AssignTaskRequest task;
     task.set_text(arguments[3]);
     pb::AssignTaskResponse graph;

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AgentClient",
-    "AgentLink",
     "Answer",
     "BallRegion",
     "CalibratedSequence",
@@ -67,6 +66,8 @@ _ERRORS = "gausslite.domain.errors"
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use. Raises AttributeError for other names."""
+    if name == "__version__":
+        return import_module("gausslite.process").installed_version()
     if name not in __all__:
         raise AttributeError(f"module 'gausslite' has no attribute {name!r}")
     # a program that only catches errors does not load the library

@@ -45,12 +45,10 @@ from gausslite.perception.pointing import pointing
 from gausslite.plugins import Group, load
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
-from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
 
 __all__ = [
     "AgentClient",
-    "AgentLink",
     "Answer",
     "BallRegion",
     "CalibratedSequence",

@@ -82,16 +82,6 @@ def is_convex(phrase: str) -> bool:
     return head_of(phrase) not in words()["nouns"]["non_convex"]
 
 
-def largest_size(phrase: str) -> tuple[float, float]:
-    """Return the longest plausible side of an object in metres, and its largest share of an image without depth.
-
-    Things may be longer than is usual for their kind.
-    """
-    head, usual_m = head_of(phrase), vocabulary().usual_length_m(phrase)
-    row = next(row for row in words()["sizes"] if head in row.get("nouns", (head,)))
-    return row["longest_m"] if usual_m is None else words()["lengths"]["slack"] * usual_m, row["image_share"]
-
-
 def same_kind(phrase: str, name: str) -> bool:
     """Return True if a task's phrase means objects of this name: equal heads, or synonyms."""
     if is_generic(phrase):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 
 from gausslite.plugins import Group, load
 
@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from gausslite.mission.schedule import ScheduledTaskMapper
     from gausslite.mission.task_mapper import FrameOutcome
     from gausslite.wire.security import Tls
+
+
+BeginView: TypeAlias = "Callable[[ScheduledTaskMapper], Callable[[FrameOutcome], None]]"
+"""To be called when the mission begins; returns what to call after each frame."""
 
 
 @runtime_checkable
@@ -37,10 +41,8 @@ class Pages(Protocol):
         """Show an agent or a fusion server, also one that starts later; the context gives the page's URL."""
         ...
 
-    def mission_view(
-        self, port: int, mission: ScheduledTaskMapper
-    ) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
-        """Show a mission of this process and print the page's URL; the context gives what to call after each frame."""
+    def mission_view(self, port: int) -> AbstractContextManager[BeginView]:
+        """Show a mission of this process, from before it begins, and print the page's URL."""
         ...
 
     def write_report(self, path: Path, folders: Sequence[Path]) -> None:

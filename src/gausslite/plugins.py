@@ -24,6 +24,7 @@ class Group(StrEnum):
 
     COMMANDS = "gausslite.commands"  # a `Command`; the name is the sub-command
     SOURCES = "gausslite.sources"  # opens recordings; the name is the prefix of an address, as in "sim:home"
+    CAMERAS = "gausslite.cameras"  # reads the camera of another tool's files
     CALIBRATORS = "gausslite.calibrators"  # estimates what a recording does not state
     PARSERS = "gausslite.parsers"  # a `ParserBackend`, which reads a sentence as a task graph
     NOUNS = "gausslite.nouns"  # a `NounVocabulary`
@@ -33,10 +34,13 @@ class Group(StrEnum):
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
     POLICIES = "gausslite.policies"  # a `MapperSettings` of another system, to compare with; the name is of `--policy`
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
+    POSES = "gausslite.poses"  # refines the poses of views, or tracks the camera; the name is a value of `--poses`
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     MONITORS = "gausslite.monitors"  # judges whether a robot is where its odometry says, and finds a lost one
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
+    REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
+    KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server

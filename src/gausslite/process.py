@@ -10,6 +10,8 @@ import os
 import signal
 import sys
 import threading
+import time
+from contextlib import suppress
 from importlib import import_module
 from types import FrameType, TracebackType
 from typing import Any, Final
@@ -20,6 +22,16 @@ from gausslite.domain.errors import MissingPluginError
 TASK_NOT_FOUND: Final = 3
 # exit code of a mission that does not know the robot's place at its end
 ROBOT_LOST: Final = 4
+
+
+def installed_version() -> str:
+    """Return the version of the installed distribution, which is looked up only on request."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("gausslite")
+    except metadata.PackageNotFoundError:
+        return "of a source tree that is not installed"
 
 
 def printable(text: str) -> str:
@@ -33,11 +45,19 @@ def printable(text: str) -> str:
 
 
 def print_message(text: str) -> None:
-    """Print one line on stderr."""
-    print(printable(text), file=sys.stderr)
+    """Print one line on stderr; without effect after the terminal has gone."""
+    with suppress(OSError):
+        print(printable(text), file=sys.stderr)
 
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_IMPATIENCE_S = 1.0
+"""Launchers repeat a signal within this, or follow with another one: only a later same one is a user's."""
+
+
+def handled_signals() -> tuple[signal.Signals, ...]:
+    """Return the signals that end a program; not those that its caller ignores, as `nohup` does with SIGHUP."""
+    return tuple(number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN)
 
 
 class _QuietEnd:
@@ -60,22 +80,21 @@ which the programs report; gRPC would log them once more.
 
 
 def end_quietly_while_starting(program: str) -> None:
-    """End the process with code 130 on SIGINT and 143 on SIGTERM, until `raise_interrupts` is called.
+    """End the process with code 130 on SIGINT, 143 on SIGTERM and 129 on SIGHUP, until `raise_interrupts` is called.
 
     Call it on the main thread, before NumPy and gRPC are loaded: it sets their variables.
     """
     for name, value in _OF_LIBRARIES.items():
         os.environ.setdefault(name, value)
-    for number in _SIGNALS:
+    for number in handled_signals():
         signal.signal(number, _QuietEnd(program))
 
 
 def raise_interrupts() -> None:
-    """Let SIGINT raise KeyboardInterrupt and SIGTERM raise Terminated, unless another handler has been installed."""
-    if isinstance(signal.getsignal(signal.SIGINT), _QuietEnd):
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if isinstance(signal.getsignal(signal.SIGTERM), _QuietEnd):
-        signal.signal(signal.SIGTERM, _raise_terminated)
+    """Let SIGINT raise KeyboardInterrupt and the others Terminated, unless another handler has been installed."""
+    for number in _SIGNALS:
+        if isinstance(signal.getsignal(number), _QuietEnd):
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else _raise_terminated)
 
 
 def run_program(program: str, module: str, function: str = "run") -> int:
@@ -119,7 +138,7 @@ def _outdated_package(error: Exception) -> str | None:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, raised as Python raises KeyboardInterrupt for SIGINT."""
+    """SIGTERM or SIGHUP, raised as Python raises KeyboardInterrupt for SIGINT."""
 
 
 def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
@@ -127,21 +146,22 @@ def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 
 class DeferredInterrupt:
-    """A context that records the first Ctrl-C or SIGTERM, so that the current step can be completed.
+    """A context that records the first Ctrl-C, SIGTERM or SIGHUP, so that the current step can be completed.
 
     pending_exception: the exception that the signal stands for, None without a signal; the caller raises it after the
-    step. A second signal raises it at once. Only the main thread can handle signals; on other threads the context
-    changes nothing.
+    step. The same signal raises it at once if it comes again a second later. Only the main thread can handle signals;
+    on other threads the context changes nothing.
     """
 
     def __init__(self) -> None:
         self.pending_exception: KeyboardInterrupt | None = None
         self._on_main_thread = threading.current_thread() is threading.main_thread()
-        self._previous = {number: signal.getsignal(number) for number in _SIGNALS}
+        self._previous = {number: signal.getsignal(number) for number in handled_signals()}
+        self._first, self._since_s = 0, 0.0
 
     def __enter__(self) -> DeferredInterrupt:
         if self._on_main_thread:
-            for number in _SIGNALS:
+            for number in self._previous:
                 signal.signal(number, self._record)
         return self
 
@@ -153,9 +173,11 @@ class DeferredInterrupt:
                 signal.signal(number, handler)
 
     def _record(self, number: int, _frame: FrameType | None) -> None:
-        if self.pending_exception is not None:
+        if self.pending_exception is None:
+            self._first, self._since_s = number, time.monotonic()
+            self.pending_exception = KeyboardInterrupt() if number == signal.SIGINT else Terminated()
+        elif number == self._first and time.monotonic() - self._since_s > _IMPATIENCE_S:
             raise self.pending_exception
-        self.pending_exception = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
 
 
 _SWITCHES = {"ORT_DISABLE_TELEMETRY": "1"}

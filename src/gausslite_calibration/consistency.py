@@ -24,9 +24,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.recording import CameraCorrection
-from gausslite.pose_fit.features import RelativePose, detect_features, relative_pose
 from gausslite_calibration.depth_consistency import find_other_depth
 from gausslite_calibration.rig_fit import REGISTERED, UNREGISTERED, PointMotion, fit_intrinsics, fit_mount
+from gausslite_poses.features import RelativePose, detect_features, relative_pose
 
 _MAX_PAIRS, _MIN_PAIRS = 12, 4
 _SMALL_MOTION, _MIN_MOTION = 0.06, 0.012
@@ -230,7 +230,7 @@ def _find_in_places(source: Source, trajectory: Trajectory, pairs: Sequence[_Pai
     wrong = [pair for pair in pairs if pair.contradicts(_motions(T_world_camera, [pair])[0])]
     for first in _unusual_steps(T_world_camera):
         with suppress(DatasetError, PoseError):  # a frame that cannot be read is reported when it is mapped
-            pair = _match(images, first, first + 1)
+            pair = match_pair(images, first, first + 1)
             if pair is not None and pair.contradicts(_motions(T_world_camera, [pair])[0]):
                 wrong.append(pair)
     if not wrong:
@@ -309,7 +309,7 @@ def _matched_pairs(source: Source) -> list[_Pair]:
     pairs = []
     for first in sorted({round(position) for position in np.linspace(0, max(count - 2, 0), _MAX_PAIRS)}):
         try:
-            pair = _match(images, first, min(first + gap, count - 1))
+            pair = match_pair(images, first, min(first + gap, count - 1))
         except (DatasetError, PoseError):
             continue
         if pair is None:
@@ -325,7 +325,7 @@ def _rectified(source: Source) -> Source:
     return source if source.lens is None else CorrectedSource(source, CameraCorrection(source.lens))
 
 
-def _match(images: Source, first: int, second: int) -> _Pair | None:
+def match_pair(images: Source, first: int, second: int) -> _Pair | None:
     """Return the pair of these positions; None without enough common points. Raises DatasetError, PoseError."""
     size = downscaled_size(images.camera)
     reference, current = images.frame(first, size), images.frame(second, size)

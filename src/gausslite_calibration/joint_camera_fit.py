@@ -21,8 +21,9 @@ from gausslite.domain.camera import Lens, LensModel, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist, inverse, transform_of, twist_of
 from gausslite.domain.recording import CameraCorrection
-from gausslite.pose_fit.least_squares import NormalEquations, robust_weights
-from gausslite.pose_fit.photometric import (
+from gausslite_calibration.moving_pairs import MIN_COMPARABLE_SHARE, FrameWarp, MovingPairs
+from gausslite_poses.least_squares import NormalEquations, robust_weights
+from gausslite_poses.photometric import (
     MAX_PIXELS,
     OPAQUE_ALPHA,
     VisiblePoints,
@@ -33,7 +34,6 @@ from gausslite.pose_fit.photometric import (
     rendered_luminance,
     with_gradients,
 )
-from gausslite_calibration.moving_pairs import MIN_COMPARABLE_SHARE, FrameWarp, MovingPairs
 
 _READOUT, _OFFSET = 0, 1
 _STEPS = np.array([0.001, 0.001, 0.01, 0.02])

@@ -22,15 +22,15 @@ from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, transform_points, twist_of
 from gausslite.domain.recording import HANDHELD_PRIOR, CameraCorrection
-from gausslite.pose_fit.photometric import (
+from gausslite.render.rasterizer import NEAR_M, Rendering
+from gausslite_calibration.registered import register_depth
+from gausslite_poses.photometric import (
     MAX_PIXELS,
     MAX_RELATIVE_DEPTH_ERROR,
     comparable_pixels,
     fit_pose,
     luminance_residual,
 )
-from gausslite.render.rasterizer import NEAR_M, Rendering
-from gausslite_calibration.registered import register_depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)

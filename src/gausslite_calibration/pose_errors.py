@@ -20,10 +20,10 @@ from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, twist_of
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
-from gausslite.pose_fit.exposure import fit_exposure
-from gausslite.pose_fit.photometric import comparable_pixels, fit_pose
 from gausslite.render.rasterizer import Rendering
 from gausslite_calibration.moving_pairs import warp_into
+from gausslite_poses.exposure import fit_exposure
+from gausslite_poses.photometric import comparable_pixels, fit_pose
 
 _MAX_PAIRS = 24
 _MIN_PAIRS = 4

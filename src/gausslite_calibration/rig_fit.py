@@ -17,8 +17,8 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera, lift
 from gausslite.domain.pose import inverse, transform_of
-from gausslite.pose_fit.features import RelativePose
-from gausslite.pose_fit.least_squares import robust_weights
+from gausslite_poses.features import RelativePose
+from gausslite_poses.least_squares import robust_weights
 
 _CAMERA, _MOUNT = slice(0, 5), slice(5, 11)
 _PRIOR_STD = np.array([0.5, 0.5, 0.2, 0.2, 0.5, *[1.0] * 3, *[0.5] * 3])

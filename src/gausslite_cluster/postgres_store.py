@@ -121,7 +121,7 @@ class PostgresConnection:
 
     def _connect(self) -> Database:
         try:
-            db = psycopg.connect(**self._parameters, autocommit=True)
+            db = psycopg.connect(**{**self._parameters, "client_encoding": "utf8"}, autocommit=True)
         except psycopg.Error as error:
             raise StorageError(self._text("not reachable", error)) from error
         try:

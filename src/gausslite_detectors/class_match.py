@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from gausslite_language.nouns import (
 
 NOUN_VECTORS_FILE: Final = "lvis_v1_clip_a+cname.npy"
 NOUN_NAMES_FILE: Final = "lvis_v1_train_cat_info.json"
+_SEPARATORS: Final = re.compile(r"\s*[/,;|]\s*")
 _COCO_VECTORS_FILE: Final = "coco_clip_a+cname.npy"
 
 
@@ -99,6 +101,11 @@ class ClassMatchSettings:
         require_plausible("class match", self)
 
 
+def class_nouns(name: str) -> tuple[str, ...]:
+    """Return the nouns that a class name states: "Drill (Tool)" is a drill, "sofa/couch" a sofa and a couch."""
+    return tuple(dict.fromkeys(normalised_noun(part.partition(" (")[0]) for part in _SEPARATORS.split(name) if part))
+
+
 def match_noun(
     phrase: str,
     class_names: Sequence[str],
@@ -113,10 +120,10 @@ def match_noun(
     settings accept it.
     """
     settings = settings or ClassMatchSettings()
+    class_names = tuple(filter(None, class_names))
     if is_generic(phrase):
         return NounMatch(phrase, MatchBasis.GENERIC, tuple(name for name in class_names if not is_structure(name)))
-    # "Drill (Tool)" is a drill
-    by_name = {normalised_noun(name.partition(" (")[0]): name for name in reversed(class_names)}
+    by_name = {noun: name for name in reversed(class_names) for noun in reversed(class_nouns(name))}
     noun, head = normalised_noun(phrase), head_of(phrase)
     # an unknown compound is a kind of its head, and a known one only if the vocabulary says so
     nouns = dict.fromkeys((noun, head) if not is_thing(noun) or is_kind_of(noun, head) else (noun,))

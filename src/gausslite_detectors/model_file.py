@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
+from gausslite.domain.file_formats import FOREIGN_BYTES, foreign_format
 from gausslite.process import disable_telemetry
 
 CHECKSUM_FILE: Final = "SHA256SUMS"
@@ -19,14 +20,7 @@ _MAX_BYTES: Final = (1 << 31) - 1
 # fields of an ONNX ModelProto by number, with their protobuf wire types: 0 varint, 2 length-delimited
 _GRAPH: Final = 7
 _FIELDS: Final = {1: 0, 2: 2, 3: 2, 4: 2, 5: 0, 6: 2, _GRAPH: 2, 8: 2, 14: 2, 20: 2, 25: 2, 26: 2}
-_FOREIGN_FORMATS: Final = (
-    (b"version https://git-lfs", "a Git LFS pointer instead of the file it points to"),
-    (b"<!", "a web page"),
-    (b"<html", "a web page"),
-    (b"PK\x03\x04", "a zip archive, as PyTorch saves its weights"),
-    (b"\x1f\x8b", "a gzip archive"),
-    (b"{", "a JSON text"),
-)
+_ZIP: Final = b"PK\x03\x04"
 _PROVIDERS: Final = ("CUDAExecutionProvider", "TensorrtExecutionProvider", "CPUExecutionProvider")
 
 
@@ -88,7 +82,7 @@ def require_onnx(path: Path) -> None:
         raise ModelFileError(f"model {path}: expected a readable ONNX model of up to 2 GiB, got {size} bytes")
     try:
         with path.open("rb") as file:
-            problem = _foreign_format(file.read(64)) or _structure_error(file, size)
+            problem = _foreign_format(file.read(FOREIGN_BYTES)) or _structure_error(file, size)
     except OSError as error:
         raise ModelFileError(f"model {path}: cannot be read: {error.strerror or error}") from error
     if problem:
@@ -133,9 +127,7 @@ def _runtime() -> Any:
 def _foreign_format(start: bytes) -> str:
     if start[4:8] == b"ORTM":
         return "a model in ORT format: use its original .onnx file"
-    trimmed = start.lstrip().lower()
-    formats = (name for magic, name in _FOREIGN_FORMATS if start.startswith(magic) or trimmed.startswith(magic))
-    return next(formats, "")
+    return "a zip archive, as PyTorch saves its weights" if start.startswith(_ZIP) else foreign_format(start)
 
 
 def _structure_error(file: BinaryIO, size: int) -> str:

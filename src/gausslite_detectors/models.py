@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -12,9 +11,10 @@ from gausslite.perception.detector import Detector
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.boxes import BoxDetector, SegmentedDetector, Segmenter
 from gausslite_detectors.depth_segmenter import DepthSegmenter
+from gausslite_detectors.layouts import ModelFamily
 from gausslite_detectors.model_file import OpenModel, open_model, sha256_of
+from gausslite_detectors.network import DetectionNetwork
 from gausslite_detectors.tiles import TiledDetector, Tiling
-from gausslite_detectors.yolo_network import MASK_COEFFICIENTS, YoloNetwork, class_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,18 +113,13 @@ VOCABULARY: Final = "vocab.txt"
 OWN_MASKS, DEPTH = "yolo", "depth"
 
 
-class ModelFamily(StrEnum):
-    """Supported networks."""
-
-    GROUNDING_DINO = "Grounding DINO"
-    YOLO_SEG = "YOLO-seg or FastSAM"
-    YOLO_BOXES = "YOLO with class names"
-    PROMPTED_YOLO = "YOLO with text features"
-    TEXT_ENCODER = "text encoder"
-
-
 def identify_family(model: OpenModel) -> ModelFamily:
     """Return the family of an open model. Raises ModelFileError if it is not supported."""
+    return _family_of_text(model) or DetectionNetwork(model).layout.family
+
+
+def _family_of_text(model: OpenModel) -> ModelFamily | None:
+    """Return the family of a model with texts as an input; None for others, whose outputs decide."""
     from gausslite_detectors.open_vocabulary import is_grounding, is_prompted
     from gausslite_detectors.text_features import TOKEN_ID_TYPES
 
@@ -135,22 +130,7 @@ def identify_family(model: OpenModel) -> ModelFamily:
         return ModelFamily.PROMPTED_YOLO
     if all(len(port.shape) == 2 and port.type in TOKEN_ID_TYPES for port in inputs):
         return ModelFamily.TEXT_ENCODER
-    has_image_input = len(inputs) == 1 and len(inputs[0].shape) == 4
-    # a dynamic size is known only after the network has run
-    channels = [output.shape[1] for output in outputs if len(output.shape) == 4]
-    has_prototypes = any(not isinstance(count, int) or count == MASK_COEFFICIENTS for count in channels)
-    if has_image_input and has_prototypes and len(outputs) == 2:
-        return ModelFamily.YOLO_SEG
-    if has_image_input and _has_named_boxes(model):
-        return ModelFamily.YOLO_BOXES
-    received = " → ".join(", ".join(f"{port.name} {port.shape}" for port in ports) for ports in (inputs, outputs))
-    raise ModelFileError(f"model {model.path}: expected one of {', '.join(ModelFamily)}; got {received}")
-
-
-def _has_named_boxes(model: OpenModel) -> bool:
-    """Return True if the only output is [1, 4+c, A] for the c class names in the metadata."""
-    (rows, *more), names = [output.shape for output in model.session.get_outputs()], class_names(model.session)
-    return not more and bool(names) and len(rows) == 3 and rows[1] in (4 + len(names), None)
+    return None
 
 
 class OnnxReader:
@@ -158,7 +138,12 @@ class OnnxReader:
 
     def open(self, path: Path, options: DetectorOptions) -> Detector:
         """Return the file's detector, also in tiles. Raises ModelFileError, InvalidInputError, KernelError."""
+        from gausslite_detectors.class_detector import ClassDetectorSettings
+
         tiling = Tiling(options.tiles_per_side, options.time_limit_s)
+        if options.min_score is not None:
+            least = options.min_score / ClassDetectorSettings().min_score * tiling.min_new_score
+            tiling = replace(tiling, min_new_score=min(least, tiling.min_new_score))
         detector = self._open(path, options)
         return detector if tiling.per_side == 1 else TiledDetector(detector, tiling)
 
@@ -168,22 +153,21 @@ class OnnxReader:
         segmenter: "yolo", "depth", or the path of a FastSAM file. None selects the detector's own masks if it has them,
         else "depth". vocabulary: the text encoder's, by default next to the detector.
         """
-        from gausslite_detectors.yolo import load_yolo
+        from gausslite_detectors.class_detector import load_class_detector
 
         model = open_model(path, options.threads)
-        family = identify_family(model)
+        family = _family_of_text(model)
         if family is ModelFamily.TEXT_ENCODER:
             raise ModelFileError(f"model {path}: expected a detector, got a {family}, which belongs beside one")
-        if family is ModelFamily.YOLO_SEG and options.segmenter in (None, OWN_MASKS):
-            return load_yolo(model, options.accept_similar)
+        classes = load_class_detector(model, options.accept_similar, options.min_score) if family is None else None
+        if classes is not None and classes.has_masks and options.segmenter in (None, OWN_MASKS):
+            return classes
         if options.segmenter == OWN_MASKS:
             raise InvalidInputError(
                 f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
             )
         segmenters = _segmenters(options.segmenter or DEPTH, options.threads)
-        if family in (ModelFamily.YOLO_SEG, ModelFamily.YOLO_BOXES):
-            return SegmentedDetector(load_yolo(model, options.accept_similar), segmenters)
-        return SegmentedDetector(_open_vocabulary(model, family, options), segmenters)
+        return SegmentedDetector(classes or _open_vocabulary(model, family, options), segmenters)
 
     def advice(self) -> str:
         """Return how to make the simplest file, in one line."""
@@ -195,25 +179,29 @@ class OnnxReader:
 READER: Final = OnnxReader()
 
 
-def _open_vocabulary(model: OpenModel, family: ModelFamily, options: DetectorOptions) -> BoxDetector:
+def _open_vocabulary(model: OpenModel, family: ModelFamily | None, options: DetectorOptions) -> BoxDetector:
     """Return a detector of any phrase with its text encoder."""
-    from gausslite_detectors.open_vocabulary import GroundingDino, PromptedYolo
+    from gausslite_detectors.open_vocabulary import GroundingDino, GroundingSettings, PromptedYolo, PromptedYoloSettings
     from gausslite_detectors.text_features import BertTokenizer, open_phrase_vectors
 
     folder = model.path.parent
+    least = options.min_score
     if family is ModelFamily.GROUNDING_DINO:
-        return GroundingDino(model, BertTokenizer(options.vocabulary or folder / VOCABULARY))
-    return PromptedYolo(model, open_phrase_vectors(folder, options.vocabulary, options.threads))
+        tokenizer = BertTokenizer(options.vocabulary or folder / VOCABULARY)
+        settings = GroundingSettings() if least is None else GroundingSettings(0.8 * least, least)
+        return GroundingDino(model, tokenizer, settings)
+    vectors = open_phrase_vectors(folder, options.vocabulary, options.threads)
+    return PromptedYolo(model, vectors, PromptedYoloSettings() if least is None else PromptedYoloSettings(least))
 
 
 def _segmenters(name: str, threads: int | None) -> tuple[Segmenter, ...]:
     """Return the depth segmenter, after that of a file for boxes in which its network finds nothing."""
     if name == DEPTH:
         return (DepthSegmenter(),)
-    from gausslite_detectors.yolo import ClassAgnosticSegmenter
+    from gausslite_detectors.class_detector import ClassAgnosticSegmenter
 
-    network = YoloNetwork(open_model(Path(name), threads))
-    if not network.has_masks:
+    network = DetectionNetwork(open_model(Path(name), threads))
+    if not network.layout.has_masks:
         raise InvalidInputError(f"segmenter: expected depth or a FastSAM file, got {name}, which finds boxes only")
     return ClassAgnosticSegmenter(network), DepthSegmenter()
 

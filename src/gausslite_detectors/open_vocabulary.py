@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,16 +17,22 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
 from gausslite_detectors.boxes import BoxSizeLimits
+from gausslite_detectors.layouts import anchors_reading
 from gausslite_detectors.model_file import OpenModel, run_once
+from gausslite_detectors.network import (
+    MEAN,
+    STANDARD_DEVIATION,
+    Letterbox,
+    boxes_in_image,
+    candidates_of,
+    letterbox,
+    suppress,
+)
 from gausslite_detectors.text_features import PhraseInput, PhraseVectors, Tokenizer, encode_phrase
-from gausslite_detectors.yolo_network import Letterbox, decode, letterbox, suppress
 
 INPUTS: Final = ("pixel_values", "input_ids", "attention_mask", "token_type_ids", "pixel_mask")
 OUTPUTS: Final = ("logits", "pred_boxes")
 _REQUIRED_INPUTS: Final = frozenset({"pixel_values", "input_ids"})
-# normalisation of the network's training images: red, green, blue
-_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32)
-_STANDARD_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
 _SHORT_SIDE_PX: Final = 800
 _LONG_SIDE_PX: Final = 1333
 _TEST_PHRASE: Final = "object"
@@ -68,11 +74,18 @@ class GroundingDino:
         length = shapes["input_ids"][1]
         self._length = length if isinstance(length, int) else None
         self._phrases: dict[str, PhraseInput] = {}
+        self._best: dict[str, DetectedBox] = {}
         self._check_outputs(model)
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return a match for every query: the network accepts any phrase."""
-        return tuple(NounMatch(query, MatchBasis.PHRASE) for query in queries)
+        least = self._settings.text_score
+        return tuple(NounMatch(query, MatchBasis.PHRASE, min_score=least) for query in queries)
+
+    def best_boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
+        """Return the box of each query whose noun has the best score in the frame of the latest `boxes`."""
+        del frame
+        return [self._best[query] for query in queries if query in self._best]
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """Return all instances of each query, best first, without boxes too large for their noun."""
@@ -94,6 +107,7 @@ class GroundingDino:
         scores, noun_scores = phrase_scores(logits, self._encoded_phrase(query).is_noun)
         boxes_px = corners_px(boxes_cxcywh, (frame.camera.width_px, frame.camera.height_px))
         areas = (boxes_px[:, 2:] - boxes_px[:, :2]).prod(axis=1)
+        self._best[query] = best_box(query, noun_scores, boxes_px)
         is_match = (scores >= self._settings.box_score) & (noun_scores >= self._settings.text_score)
         rows = np.flatnonzero(is_match & (areas > 0))
         if len(rows) == 0:
@@ -147,6 +161,13 @@ class GroundingDino:
             )
 
 
+def best_box(query: str, scores: Float32[ndarray, " n"], boxes_px: Float32[ndarray, "n 4"]) -> DetectedBox:
+    """Return the box with the best score."""
+    row = int(scores.argmax())
+    left, top, right, bottom = (float(edge) for edge in boxes_px[row])
+    return DetectedBox(query, float(scores[row]), (left, top, right, bottom), is_weak=True)
+
+
 def phrase_scores(
     logits: Float32[ndarray, "q l"], is_noun: Sequence[bool]
 ) -> tuple[Float32[ndarray, " q"], Float32[ndarray, " q"]]:
@@ -190,7 +211,7 @@ def preprocess(
     shrinks = inner_w < w
     scaled = cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     values = np.zeros((1, 3, height, width), np.float32)
-    normalised = (scaled.astype(np.float32) / 255 - _MEAN) / _STANDARD_DEVIATION
+    normalised = (scaled.astype(np.float32) / 255 - MEAN) / STANDARD_DEVIATION
     values[0, :, :inner_h, :inner_w] = normalised.transpose(2, 0, 1)
     mask = np.zeros((1, height, width), np.int64)
     mask[:, :inner_h, :inner_w] = 1
@@ -279,6 +300,7 @@ class PromptedYolo:
         """Run the model once to check its outputs. Raises ModelFileError."""
         self._settings = settings or PromptedYoloSettings()
         self._path, self._session, self._vectors = model.path, model.session, vectors
+        self._best: dict[str, DetectedBox] = {}
         self._inputs = PromptedInputs.of(model.path, model.session)
         if vectors.dimensions != self._inputs.dimensions:
             raise ModelFileError(
@@ -291,7 +313,13 @@ class PromptedYolo:
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return what each query is searched as."""
-        return tuple(self._vectors.match(query) for query in queries)
+        least = self._settings.min_score
+        return tuple(replace(self._vectors.match(query), min_score=least) for query in queries)
+
+    def best_boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
+        """Return the box of each query with the best score in the frame of the latest `boxes`."""
+        del frame
+        return [self._best[query] for query in queries if query in self._best]
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """Return all instances of each query, best first, without boxes too large for their noun."""
@@ -345,7 +373,10 @@ class PromptedYolo:
         self, query: str, rows: Float32[ndarray, "5 a"], letterboxing: Letterbox, frame: Frame
     ) -> list[DetectedBox]:
         size_px = (frame.camera.height_px, frame.camera.width_px)
-        candidates = decode(rows, 1, letterboxing, size_px, self._settings.min_score)
+        reading = anchors_reading(rows, 1, np.zeros((0, 1, 1), np.float32))
+        every = boxes_in_image(reading.boxes, letterboxing, size_px)
+        self._best[query] = best_box(query, reading.scores, every)
+        candidates = candidates_of(reading, letterboxing, size_px, self._settings.min_score)
         kept = suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=True)
         boxes = []
         for score, corners in zip(kept.scores, kept.boxes_px, strict=True):

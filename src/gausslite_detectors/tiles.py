@@ -79,21 +79,21 @@ class TiledDetector:
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return the detections of the whole image and the small ones of its tiles, best first."""
         start_s = self._clock()
-        found = list(self._detector.detect(frame, queries))
+        found, unseen = _seen_and_unseen(self._detector.detect(frame, queries))
         size_px = frame.depth_m.shape
         in_tiles: list[Detection] = []
         for tile in self._tiles_in_time(size_px, start_s):
-            whole = [
-                detection
-                for detection in self._detector.detect(crop(frame, tile), queries)
-                if self._is_whole_and_small(detection, tile, size_px)
-            ]
+            seen, unseen_here = _seen_and_unseen(self._detector.detect(crop(frame, tile), queries))
+            unseen += [self._in_image(box, tile, np.zeros(size_px, np.bool_)) for box in unseen_here]
+            whole = [detection for detection in seen if self._is_whole_and_small(detection, tile, size_px)]
             # detections of several nouns that share a mask share it in the image too: they show one object
             masks = {id(detection.mask): _mask_in_image(detection.mask, tile, size_px) for detection in whole}
             in_tiles += [self._in_image(detection, tile, masks[id(detection.mask)]) for detection in whole]
         for detection in sorted(in_tiles, key=lambda detection: -detection.score):
             found = self._merged(found, detection)
-        return sorted(found, key=lambda detection: -detection.score)
+        nouns = {detection.phrase for detection in found}
+        best = {box.phrase: box for box in sorted(unseen, key=lambda box: box.score) if box.phrase not in nouns}
+        return sorted((*found, *best.values()), key=lambda detection: -detection.score)
 
     def _tiles_in_time(self, size_px: tuple[int, ...], start_s: float) -> Iterator[Tile]:
         """Yield the tiles for which the time suffices, from the first one that was left out before."""
@@ -146,6 +146,12 @@ class TiledDetector:
         shared = int(np.count_nonzero(mask_a & mask_b))
         smaller = min(int(np.count_nonzero(mask_a)), int(np.count_nonzero(mask_b)))
         return shared >= self._tiling.min_shared_share * smaller
+
+
+def _seen_and_unseen(detections: Sequence[Detection]) -> tuple[list[Detection], list[Detection]]:
+    """Return the detections with a mask, and those without one, which are only reported."""
+    seen = [detection for detection in detections if detection.mask.any()]
+    return seen, [detection for detection in detections if not detection.mask.any()]
 
 
 def tiles_of(size_px: tuple[int, ...], tiling: Tiling) -> Iterator[Tile]:

@@ -236,10 +236,20 @@ class _SelectedFrames:
                 yield position, frame
 
 
+def _is_same_recording(mapped: object, scored: str) -> bool:
+    """True if two addresses name one recording: by another path, or by one that held in another working folder."""
+    paths = [Path(str(spec).removeprefix("bag:").partition("?")[0]).expanduser() for spec in (mapped, scored)]
+    of_map, of_views = (path.resolve() for path in paths)
+    is_elsewhere = not of_map.exists() and of_views.exists() and of_map.name == of_views.name
+    return mapped == scored or (of_views.exists() and of_map == of_views) or is_elsewhere
+
+
 def _report_other_world(options: argparse.Namespace, recorded: Source) -> None:
     """Print a message if the map is that of another sequence, and its poses' frame has another name."""
     of_map, of_views = read_world_frame(options.map), default_world_frame(recorded)
-    if of_map not in ("", of_views) and read_report(options.map.parent).get("source") != options.source:
+    if of_map not in ("", of_views) and not _is_same_recording(
+        read_report(options.map.parent).get("source"), options.source
+    ):
         print_message(
             f"{options.map} is in the world frame {of_map!r}, the poses of {options.source} in {of_views!r}; the "
             "scores hold only if both are one frame"
@@ -249,7 +259,7 @@ def _report_other_world(options: argparse.Namespace, recorded: Source) -> None:
 def _test_every(options: argparse.Namespace) -> int | None:
     """Return which views are scored; print a message if it comes from the report, or if the map was trained on them."""
     report = read_report(options.map.parent)
-    if options.test_every is not None or report.get("source") != options.source:
+    if options.test_every is not None or not _is_same_recording(report.get("source"), options.source):
         return None if options.test_every == 1 else options.test_every
     held_out, mapped = report.get("hold_out"), report.get("selected_frames", options.frames)
     if not isinstance(held_out, int):

@@ -18,10 +18,10 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.domain.relevance import MIN_ROI_PIXELS, Region, largest_roi_per_segment
-from gausslite.pose_fit.exposure import fit_exposure
-from gausslite.pose_fit.photometric import fit_pose
 from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rendering
+from gausslite_poses.exposure import fit_exposure
+from gausslite_poses.photometric import fit_pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)

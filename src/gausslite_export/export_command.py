@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
+from gausslite.codec.ply import HARMONICS
 from gausslite.codec.run_files import KeyframeView
 from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
@@ -66,6 +67,8 @@ def _report(options: argparse.Namespace, chosen: Format, content: MapContent, ou
     size = out.stat().st_size
     for note in content.notes:
         print_message(note)
+    if content.harmonics is not None and not chosen.keeps_harmonics:
+        print_message(f"left out {HARMONICS}: --to {options.to} has one colour for each Gaussian")
     if "min_opacity" in chosen.uses and not content.views:
         print_message("free space is unknown: expected a results folder with keyframes.json, got none")
     if options.json:

@@ -6,6 +6,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from jaxtyping import Float32
+from numpy import ndarray
+
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
@@ -20,7 +23,8 @@ class MapContent:
     """A map and the other content of its results folder; `views` and `report` are empty for a single PLY file.
 
     gaussians: the whole map. chosen: the Gaussians to write, at least one. left_out: how many Gaussians of the file are
-    in neither; notes: why, because they are no numbers, too far away or too large.
+    in neither; notes: why, because they are no numbers, too far away or too large. harmonics: of the chosen ones, for
+    each channel the coefficients above degree 0 of colours that depend on the view; None if all have one colour.
     """
 
     gaussians: Gaussians
@@ -30,6 +34,7 @@ class MapContent:
     world_frame: str = ""
     views: Sequence[KeyframeView] = ()
     report: Mapping[str, object] = field(default_factory=dict)
+    harmonics: Float32[ndarray, "n 3 k"] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,8 @@ class Format:
     suffix: of the written file. summary: a few words for the help. write: writes `chosen` of the content; raises
     InvalidInputError, StorageError. region_only: without a choice of the user, write only the task's region.
     max_extent_m: the largest coordinate and standard deviation that the format holds. companion: suffix of a second
-    file with the same name. is_upright: its z axis points up. uses: names of the options that have an effect, of
+    file with the same name. is_upright: its z axis points up. keeps_harmonics: it holds colours that depend on the
+    view. uses: names of the options that have an effect, of
     "voxel", "min_opacity" and "seconds".
     """
 
@@ -65,6 +71,7 @@ class Format:
     max_extent_m: float = MAX_EXTENT_M
     companion: str = ""
     is_upright: bool = False
+    keeps_harmonics: bool = False
     uses: tuple[str, ...] = ()
 
     def files(self, out: Path) -> tuple[Path, ...]:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
@@ -18,9 +18,9 @@ from gausslite.codec.run_files import read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
-from gausslite.domain.pose import transform_of
+from gausslite.domain.pose import transform_of, twist_of
 from gausslite.mission.results import map_file, stated_up
-from gausslite.process import import_extra
+from gausslite.process import import_extra, print_message
 from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
 from gausslite_export.free_cells import free_voxels
 from gausslite_export.mesh import write_mesh
@@ -35,6 +35,7 @@ from gausslite_export.occupancy import (
 )
 from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite_export.video import write_video
+from gausslite_render.harmonics import rotated
 
 _PCD_ROW = np.dtype(
     [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
@@ -105,10 +106,12 @@ def read_map(
     stored = read_stored_map(file)
     if not len(stored.gaussians):
         raise InvalidInputError(f"{path}: expected a map with at least one Gaussian, got an empty map")
-    gaussians = stored.gaussians.take(_largest_extent_m(stored.gaussians) <= max_extent_m)
+    near = _largest_extent_m(stored.gaussians) <= max_extent_m
+    gaussians, harmonics = stored.gaussians.take(near), stored.harmonics[near]
     if not len(gaussians):
         raise InvalidInputError(f"{path}: expected Gaussians within {max_extent_m:g} m of the origin, got none")
     chosen = gaussians if region == "all" else gaussians.take(gaussians.active)
+    harmonics = harmonics if region == "all" else harmonics[gaussians.active]
     if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
@@ -120,21 +123,30 @@ def read_map(
             f"{max_extent_m:g} m, got larger ones",
         )
     total = len(stored.gaussians) + stored.left_out
+    kept = harmonics if harmonics.any() else None
     return MapContent(
-        gaussians, chosen, total - len(gaussians), notes, world_frame=stored.world_frame, views=views, report=report
+        gaussians=gaussians,
+        chosen=chosen,
+        left_out=total - len(gaussians),
+        notes=notes,
+        world_frame=stored.world_frame,
+        views=views,
+        report=report,
+        harmonics=kept,
     )
 
 
 def upright(content: MapContent) -> MapContent:
     """Return the map turned so that z points up, with a note, if its up is stated. Raises InvalidInputError."""
     up = np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
-    axis = np.array((up[1], -up[0], 0.0))
-    length = float(np.linalg.norm(axis))
-    if length < _LEAST_TURN and up[2] > 0:
+    T = upright_motion(up)
+    turn_rad = twist_of(T)[3:]
+    angle_rad = float(np.linalg.norm(turn_rad))
+    if angle_rad == 0.0:
         return content
-    angle_rad, axis = float(np.arctan2(length, up[2])), axis / length if length > 0 else np.array((1.0, 0.0, 0.0))
-    T = transform_of(np.concatenate([np.zeros(3), angle_rad * axis]))
-    about, shown = (",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (axis, up))
+    about, shown = (
+        ",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (turn_rad / angle_rad, up)
+    )
     note = (
         f"up is {shown} in the map: it is turned by {np.degrees(angle_rad):.1f} deg about {about}, so that z points up"
     )
@@ -142,9 +154,20 @@ def upright(content: MapContent) -> MapContent:
         content,
         gaussians=move_gaussians(content.gaussians, T),
         chosen=move_gaussians(content.chosen, T),
+        harmonics=None if content.harmonics is None else rotated(content.harmonics, T[:3, :3]),
         views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
         notes=(*content.notes, note),
     )
+
+
+def upright_motion(up: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
+    """Return the smallest rotation after which this direction is z."""
+    axis = np.array((up[1], -up[0], 0.0))
+    length = float(np.linalg.norm(axis))
+    if length < _LEAST_TURN and up[2] > 0:
+        return np.eye(4)
+    angle_rad, axis = float(np.arctan2(length, up[2])), axis / length if length > 0 else np.array((1.0, 0.0, 0.0))
+    return transform_of(np.concatenate([np.zeros(3), angle_rad * axis]))
 
 
 def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
@@ -171,13 +194,38 @@ def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
+_OUTLIER_FACTOR, _LEAST_REACH_M = 20.0, 20.0
+
+
+def _without_outliers(content: MapContent) -> MapContent:
+    """Return the map without what lies, or reaches, 20 times as far from its middle as 99 % of it, with a message.
+
+    The cells of a grid cover all that is between; a single Gaussian of a wrong measurement would decide their number.
+    """
+    middle_m = np.median(content.chosen.means_m, axis=0)
+
+    def reach_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
+        largest: Float32[ndarray, " n"] = np.abs(gaussians.means_m - middle_m).max(axis=1) + gaussians.scales_m.max(
+            axis=1
+        )
+        return largest
+
+    reaches_m = reach_m(content.chosen)
+    limit_m = max(_LEAST_REACH_M, _OUTLIER_FACTOR * float(np.percentile(reaches_m, 99)))
+    far = int(np.count_nonzero(reaches_m > limit_m))
+    if far:
+        print_message(f"left out {far} Gaussians that lie or reach farther than {limit_m:.0f} m from the map's middle")
+    kept = content.gaussians.take(reach_m(content.gaussians) <= limit_m)
+    return replace(content, gaussians=kept, chosen=content.chosen.take(reaches_m <= limit_m))
+
+
 def _octomap(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    occupancy = _occupancy(settings)
+    content, occupancy = _without_outliers(content), _occupancy(settings)
     write_octomap(path, content.chosen, occupancy, _free(content, settings, occupancy))
 
 
 def _nav2(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    occupancy = _occupancy(settings)
+    content, occupancy = _without_outliers(content), _occupancy(settings)
     write_nav2(path, content.chosen, occupancy, _free(content, settings, occupancy))
 
 
@@ -202,17 +250,25 @@ def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
 
 
 PLY: Final = Format(
-    ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
+    ".ply",
+    "3D Gaussian splatting PLY",
+    lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame, map_.harmonics),
+    keeps_harmonics=True,
 )
 SPZ: Final = Format(
     ".spz",
     "compressed splats (SPZ)",
-    lambda path, map_, _: write_spz(path, map_.chosen),
+    lambda path, map_, _: write_spz(path, map_.chosen, map_.harmonics),
     max_extent_m=MAX_SPZ_COORDINATE_M,
+    keeps_harmonics=True,
 )
 SPLAT: Final = Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen))
 GLTF: Final = Format(
-    ".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen), is_upright=True
+    ".glb",
+    "KHR_gaussian_splatting",
+    lambda path, map_, _: write_gltf(path, map_.chosen, map_.harmonics),
+    is_upright=True,
+    keeps_harmonics=True,
 )
 PCD: Final = Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen))
 LAS: Final = Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen))

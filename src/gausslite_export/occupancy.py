@@ -32,7 +32,9 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Values of a cell, as in nav_msgs/OccupancyGrid."""
 _GREY_VALUES = np.zeros(256, np.uint8)
 _GREY_VALUES[[UNKNOWN, FREE, OCCUPIED]] = 205, 254, 0
-"""Of nav2's trinary map images, by the value of a cell."""
+"""Of trinary map images, by the value of a cell."""
+_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
+"""Map servers read (255 - grey) / 255 beyond these as occupied and free: 0.1961 for unknown must lie between."""
 _FLOOR_SHARE = 0.25
 """Of the fullest layer of voxels. Ellipsoids of the floor reach below it, but few of them."""
 NO_VOXELS: Int64[ndarray, "0 3"] = np.zeros((0, 3), np.int64)
@@ -130,8 +132,8 @@ def write_nav2(
         "resolution": settings.voxel_m,
         "origin": [float(origin_m[0]), float(origin_m[1]), 0.0],
         "negate": 0,
-        "occupied_thresh": 0.65,
-        "free_thresh": 0.25,
+        "occupied_thresh": _OCCUPIED_THRESHOLD,
+        "free_thresh": _FREE_THRESHOLD,
     }
     write_atomic(path, yaml.safe_dump(description, sort_keys=False).encode())
 
@@ -162,7 +164,7 @@ def planar_grid(
         raise InvalidInputError(
             f"nav2: expected at most {_MAX_GRID_CELLS} cells, got {width} x {height}; use a larger --voxel"
         )
-    floor = _floor(voxels)
+    floor = floor_layer(voxels)
     above_m, free_above_m = ((found[:, 2] - floor) * settings.voxel_m for found in (voxels, free))
     low_m, high_m = settings.height_m
     inside = ((free >= first) & (free <= last))[:, :2].all(axis=1)
@@ -177,7 +179,7 @@ def planar_grid(
     return grid, first[:2]
 
 
-def _floor(voxels: Int64[ndarray, "v 3"]) -> int:
+def floor_layer(voxels: Int64[ndarray, "v 3"]) -> int:
     """Return the height of the floor: the fullest of the layers that rise from the lowest full one."""
     lowest = voxels[:, 2].min()
     layers = np.bincount(voxels[:, 2] - lowest)

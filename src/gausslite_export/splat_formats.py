@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import struct
+from bisect import bisect_right
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.frame import linear_light
 from gausslite.domain.gaussians import Gaussians
 from gausslite.process import import_extra
+from gausslite_render.harmonics import COUNTS, rotated
 
 _SPLAT_ROW = np.dtype([("mean_m", "<f4", 3), ("scale_m", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 _OPACITY_EDGE = 1e-6
@@ -46,7 +48,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
     write_atomic(path, rows.tobytes())
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> None:
+def write_spz(path: Path, gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"] | None = None) -> None:
     """Write an SPZ file with the gsply library. Raises InvalidInputError without it, StorageError.
 
     SPZ's axes are right, up, back, and viewers take PLY's as right, down, forward; therefore y and z change sign here,
@@ -59,13 +61,19 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
         scales=np.log(np.maximum(gaussians.scales_m, np.finfo(np.float32).tiny)),
         quats=_unit_quaternions(gaussians) * np.concatenate([[np.float32(1)], _TURN_ABOUT_X]),
         opacities=np.log(opacity / (1 - opacity)).astype(np.float32),
-        sh0=_harmonics(gaussians),
-        shN=np.zeros((len(gaussians), 0, 3), np.float32),
+        sh0=_degree_0(gaussians),
+        shN=np.zeros((len(gaussians), 0, 3), np.float32) if harmonics is None else _spz_harmonics(harmonics),
     )
     write_atomic_with(path, lambda partial: gsply.write_spz(str(partial), data))
 
 
-def write_gltf(path: Path, gaussians: Gaussians) -> None:
+def _spz_harmonics(harmonics: Float32[ndarray, "n 3 k"]) -> Float32[ndarray, "n k 3"]:
+    """Return the coefficients in SPZ's axes and order."""
+    turned = rotated(harmonics, np.diag(_TURN_ABOUT_X).astype(np.float64))
+    return np.ascontiguousarray(turned.transpose(0, 2, 1))
+
+
+def write_gltf(path: Path, gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"] | None = None) -> None:
     """Write a binary glTF file (.glb): points with the extension KHR_gaussian_splatting, release candidate.
 
     Scales are metres and opacities linear. COLOR_0 lets viewers without the extension show coloured points; glTF
@@ -78,8 +86,11 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
         "KHR_gaussian_splatting:ROTATION": _unit_quaternions(gaussians)[:, [1, 2, 3, 0]],
         "KHR_gaussian_splatting:SCALE": gaussians.scales_m,
         "KHR_gaussian_splatting:OPACITY": gaussians.opacities,
-        "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": _harmonics(gaussians),
+        "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": _degree_0(gaussians),
     }
+    for i, coefficients in enumerate([] if harmonics is None else harmonics.transpose(2, 0, 1)):
+        degree = bisect_right(COUNTS, i)
+        columns[f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{i - COUNTS[degree - 1]}"] = coefficients
     write_atomic(path, _glb(columns, len(gaussians)))
 
 
@@ -138,7 +149,7 @@ def _as_bytes(values: Float32[ndarray, "n *k"]) -> ndarray:
     return np.clip(np.round(values * 255), 0, 255).astype(np.uint8)
 
 
-def _harmonics(gaussians: Gaussians) -> Float32[ndarray, "n 3"]:
+def _degree_0(gaussians: Gaussians) -> Float32[ndarray, "n 3"]:
     """Return the colours as coefficients of the spherical harmonic of degree 0."""
     return ((gaussians.rgb - 0.5) / SH_C0).astype(np.float32)
 

@@ -10,10 +10,11 @@ from typing import Final
 from gausslite.config.option import check_options, option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.task import TaskParser
-from gausslite_language.models.parsers import CachedParser, FallbackParser, LanguageModel, LanguageParser
+from gausslite_language.models.parsers import AddingParser, CachedParser, FallbackParser, LanguageModel, LanguageParser
 from gausslite_language.rules import RuleParser
 
 _RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
+_MODES: Final = ("parse", "add")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +55,13 @@ class ModelSettings:
         choices=_RESPONSE_FORMATS,
         needs="backend=http",
     )
+    mode: str = option(
+        _MODES[0],
+        "parse: the model parses; add: rules do, and the model only adds nouns that their graph lacks",
+        key="llm-mode",
+        choices=_MODES,
+        needs="backend=onnx|http",
+    )
     timeout_s: float = 10.0
     key_variable: str = "GAUSSLITE_LLM_API_KEY"
 
@@ -75,7 +83,8 @@ class OnnxBackend:
         """Return the parser with its model loaded. Raises InvalidInputError, ModelFileError."""
         from gausslite_language.models.onnx import OnnxLanguageModel
 
-        return _with_rules("onnx", OnnxLanguageModel(Path(self.settings.model or ""), self.settings.timeout_s))
+        model = OnnxLanguageModel(Path(self.settings.model or ""), self.settings.timeout_s)
+        return _with_rules("onnx", self.settings.mode, model)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +107,11 @@ class HttpBackend:
         key = os.environ.get(chosen.key_variable) or None
         response_format = ResponseFormat(chosen.response_format)
         settings = HttpSettings(chosen.url or "", chosen.model or "", response_format, chosen.timeout_s, key)
-        return _with_rules("http", HttpLanguageModel(settings))
+        return _with_rules("http", chosen.mode, HttpLanguageModel(settings))
 
 
-def _with_rules(name: str, model: LanguageModel) -> TaskParser:
+def _with_rules(name: str, mode: str, model: LanguageModel) -> TaskParser:
     """Return the parser of a model; its answers are cached, and rules parse what it fails to."""
-    parser = LanguageParser(model)
-    return FallbackParser(CachedParser(parser, name, parser.version), name, RuleParser())
+    parser, rules = LanguageParser(model), RuleParser()
+    chosen = AddingParser(parser, rules) if mode == "add" else parser
+    return FallbackParser(CachedParser(chosen, name, parser.version), name, rules)

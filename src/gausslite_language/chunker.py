@@ -216,7 +216,12 @@ _THEY: Final = word_set("they he she")
 
 def chunk_sentence(text: str) -> list[Chunk]:
     """Return the chunks of one normalised sentence, in order."""
-    return apply_corrections(_Chunker(tag_words(lexical_units(text))).run())
+    return chunk_tagged(tag_words(lexical_units(text)))
+
+
+def chunk_tagged(tagged: Sequence[tuple[str, Tag]]) -> list[Chunk]:
+    """Return the chunks of the tagged words of a sentence, in order."""
+    return apply_corrections(_Chunker(tagged).run())
 
 
 class _Chunker:

@@ -18,6 +18,8 @@ _MAX_STEPS: Final = 3
 _MAX_KINDS: Final = 60
 # one class stands for a noun with at most this many kinds: "computer monitor" for a monitor, no sandal for a shoe
 _KINDS_PER_CLASS: Final = 10
+# a shared hypernym of more kinds makes no two things near: furniture has 189, "device" 2715
+_MAX_NEAR_KINDS: Final = 200
 _COLLECTIVE_ENDINGS: Final = ("ry", "ware", "s")
 
 
@@ -179,12 +181,13 @@ def _may_be_kind(noun: str, other: str) -> bool:
 
 
 def nearest_names(noun: str, class_names: Sequence[str], count: int = 3) -> tuple[str, ...]:
-    """Return the class names that share the nearest hypernym with a noun; empty for an unknown noun."""
+    """Return the class names that share the nearest hypernym of few kinds with a noun; empty for an unknown noun."""
     known = vocabulary()
     ours = _all_above(known, known.main(noun))
     shared: list[tuple[int, str]] = []
     for name in class_names:
         common = ours.keys() & _all_above(known, known.main(name.casefold())).keys()
+        common = {at for at in common if known.kinds[at] <= _MAX_NEAR_KINDS}
         if common:
             shared.append((min(ours[at] + _all_above(known, known.main(name.casefold()))[at] for at in common), name))
     return tuple(name for steps, name in sorted(shared)[:count] if steps <= 1 + _MAX_STEPS)

@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-
-from gausslite.codec.json import object_as_json, object_from_json
-from gausslite.codec.ply import read_ply
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build
 from gausslite.config.program import add_flags
-from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import Answer, ObjectReport, OrientedBox, TeamObject, oriented_box
-from gausslite.domain.pose import UpAxis, upward_axis
-from gausslite.domain.task import TaskGraph
-from gausslite.fusion.objects import merge_objects
-from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
-from gausslite.plugins import Group, load
+from gausslite.domain.objects import OrientedBox, TeamObject
+from gausslite.mission.results import as_text
 from gausslite.wire.security import TlsFiles
-from gausslite_language.rules import RuleParser
+from gausslite_language.mapped_objects import as_json, query, read_folder, select
 
 _NS_PER_S = 1e9
 _EPOCH_TIMES_S = 1e8
@@ -54,30 +40,15 @@ def configure(parser: CommandParser) -> None:
     parser.set_defaults(run=run)
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """The objects of a map, with notes; of a folder also its Gaussians and last camera pose, None if it has none."""
-
-    objects: Sequence[TeamObject]
-    up_axis: UpAxis = (0.0, 0.0, 1.0)
-    targets: tuple[str, ...] = ()
-    gaussians: Gaussians | None = None
-    T_world_camera: Float64[ndarray, "4 4"] | None = None
-    notes: tuple[str, ...] = ()
-
-
 def run(options: argparse.Namespace) -> int:
     """Print the objects, the most confident first. Returns 0, or 1 if there is none."""
     folder = Path(options.place)
-    place = _read_folder(folder) if folder.is_dir() else _query(options)
-    objects, notes = _select(place, options.question)
+    place = read_folder(folder) if folder.is_dir() else query(options.place, build(TlsFiles, options).read())
+    objects, notes = select(place, options.question)
     notes = (*notes, *place.notes)
-    boxes = [
-        None if place.gaussians is None else oriented_box(found.landmark, place.gaussians, place.targets, place.up_axis)
-        for found in objects
-    ]
+    boxes = [place.box(found) for found in objects]
     if options.json:
-        values = [_as_json(*pair) for pair in zip(objects, boxes, strict=True)]
+        values = [as_json(*pair) for pair in zip(objects, boxes, strict=True)]
         print(as_text({"count": len(objects), "objects": values, "notes": list(notes)}))
     else:
         for pair in zip(objects, boxes, strict=True):
@@ -89,20 +60,6 @@ def run(options: argparse.Namespace) -> int:
     return 0 if objects else 1
 
 
-def _select(place: _Place, question: str) -> tuple[Sequence[TeamObject], Sequence[str]]:
-    """Return the objects that a noun or a question means, with notes. Raises InvalidInputError, TaskError."""
-    if not question:
-        return place.objects, ()
-    try:
-        graph = RuleParser().parse(question)
-    except TaskError as error:
-        raise InvalidInputError(f"QUESTION: {error}") from error
-    by_id = {team_object.landmark.object_id: team_object for team_object in place.objects}
-    answer: Callable[..., Answer] = load(Group.QUESTIONS, purpose="questions")
-    found = answer(graph, [team_object.landmark for team_object in place.objects], place.up_axis, place.T_world_camera)
-    return [by_id[landmark.object_id] for landmark in found.objects], found.notes
-
-
 def _count(count: int, question: str, known: Sequence[TeamObject]) -> str:
     """Return how many objects were found; without any, also what the map has."""
     if count:
@@ -110,56 +67,6 @@ def _count(count: int, question: str, known: Sequence[TeamObject]) -> str:
     nouns = sorted({team_object.landmark.noun for team_object in known})[:_MAX_LISTED]
     has = f"; the map has {', '.join(nouns)}" if nouns else ""
     return f"no object{f' for {quote_name(question)}' if question else ''}{has}"
-
-
-def _query(options: argparse.Namespace) -> _Place:
-    # imported late, because the objects of a folder need no gRPC
-    from gausslite.wire.channel import require_callable
-    from gausslite.wire.clients import FusionClient
-
-    require_callable("a fusion server or the output folder of a run", options.place)
-    with FusionClient(options.place, tls=build(TlsFiles, options).read()) as client:
-        left_out = client.unlocalised()
-        notes = tuple(f"the objects of {agent_id} are left out; {reason}" for agent_id, reason in left_out.items())
-        return _Place(client.query_objects(), notes=notes)
-
-
-def _read_folder(folder: Path) -> _Place:
-    """Return the objects in report.json, with what the folder has of the map. Raises InvalidInputError, CodecError."""
-    report = read_report(folder)
-    values = report.get("objects")
-    if not isinstance(values, list):
-        raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
-    agent_id = str(report.get("agent_id") or folder.resolve().name)
-    targets = report.get("targets")
-    nouns = tuple(str(target) for target in targets) if isinstance(targets, list) else ()
-    graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
-    objects = merge_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))})
-    map_file, trajectory = folder / "map.ply", folder / TRAJECTORY
-    poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
-    return _Place(
-        objects,
-        stated_up(report) or upward_axis(poses),
-        nouns,
-        read_ply(map_file) if map_file.is_file() else None,
-        poses[-1] if len(poses) else None,
-    )
-
-
-def _as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, object]:
-    observers = [
-        {
-            "agent_id": observer.agent_id,
-            "id": observer.object_id,
-            "target": observer.target,
-            "confidence": observer.confidence,
-            "first_seen_ns": observer.first_seen_ns,
-            "last_seen_ns": observer.last_seen_ns,
-        }
-        for observer in team_object.observers
-    ]
-    oriented = {} if box is None else {"yaw_rad": box.yaw_rad, "oriented_size_m": list(box.size_m)}
-    return {**object_as_json(team_object.landmark), **oriented, "observers": observers}
 
 
 def _describe(team_object: TeamObject, box: OrientedBox | None) -> str:

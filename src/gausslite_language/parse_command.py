@@ -16,7 +16,7 @@ def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite parse`."""
     parser.add_argument("text", metavar="TEXT", help='for example "Pick up the mug on the table"')
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
-    Program.of(*parser_options(), flags="backend llm-model llm-url").add_to(parser)
+    Program.of(*parser_options(), flags="backend llm-model llm-url llm-mode").add_to(parser)
     parser.set_defaults(run=run)
 
 

@@ -14,6 +14,7 @@ from gausslite.config.option import build
 from gausslite.config.program import add_flags
 from gausslite.config.values import read_path
 from gausslite.domain.checks import require_identifier
+from gausslite.domain.errors import MismatchError
 from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, size_text
 from gausslite.wire.channel import is_agent, require_callable
@@ -104,6 +105,7 @@ def run_unban(options: argparse.Namespace) -> int:
     return 0
 
 
+_EMPTY, _HEADER_BYTES = b"\nelement vertex 0\n", 1 << 12
 _STRATEGIES = ("vote", "refined", "concatenation")
 
 
@@ -127,6 +129,9 @@ def run_fetch(options: argparse.Namespace) -> int:
     prepare_file(options.out, MAP_FILE)
     with fusion_client(options) as client:
         data = client.export(Export(options.strategy, options.agent))
+    if _EMPTY in data[:_HEADER_BYTES]:
+        whose = f"agent {options.agent}" if options.agent else "any agent"
+        raise MismatchError(f"{options.address}: the map is empty: the server has no Gaussians of {whose}")
     write_atomic(options.out, data)
     print(f"wrote {options.out}, {size_text(len(data))}")
     return 0
@@ -177,6 +182,8 @@ def run_refine(options: argparse.Namespace) -> int:
         if options.out is not None:
             write_atomic(options.out, client.export(Export("refined")))
             print(f"wrote {options.out}")
+        else:
+            print(f"get it with: gausslite fetch {options.address} --strategy refined --out refined.ply")
     return 0
 
 

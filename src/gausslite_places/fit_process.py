@@ -146,7 +146,7 @@ def _samples(data: bytes) -> SurfaceSamples:
 
 if __name__ == "__main__":
     # whoever started this process ends it
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICENESS)
     _serve(Connection(sys.stdin.fileno()))

@@ -17,8 +17,6 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, transform_points, translation_m
-from gausslite.pose_fit.features import FeatureView, detect_features, relative_pose
-from gausslite.pose_fit.photometric import OPAQUE_ALPHA
 from gausslite_places.descriptors import PlaceDescriptor, PlaceIndex, describe
 from gausslite_places.surface_registration import (
     Surface,
@@ -28,6 +26,8 @@ from gausslite_places.surface_registration import (
     register,
 )
 from gausslite_places.verification import RenderMap, Verification, reduced, verify
+from gausslite_poses.features import FeatureView, detect_features, relative_pose
+from gausslite_poses.photometric import OPAQUE_ALPHA
 
 _CANDIDATES = 10
 _WIDTH_PX = 320

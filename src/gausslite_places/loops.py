@@ -23,7 +23,6 @@ from gausslite.domain.state import State, add_prefix, get_array, get_counts, int
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.pose_corrector import LoopCounts, PoseCorrector
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
-from gausslite.pose_fit.photometric import align_images
 from gausslite.process import print_message
 from gausslite.render.rasterizer import Rasterizer, Rendering, Subset
 from gausslite_calibration.moving_pairs import warp_into
@@ -32,6 +31,7 @@ from gausslite_places.localisation import View, guessed_motions
 from gausslite_places.pose_graph import Loop, PoseGraph, require_graph_solver
 from gausslite_places.surface_registration import register
 from gausslite_places.verification import RenderMap, reduced, verify
+from gausslite_poses.photometric import align_images
 
 MIN_GAP = 8
 """Keyframes between two passes; what lies closer together in time is aligned by the refinement of views."""

@@ -19,8 +19,8 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import orthonormal, transform_of
-from gausslite.pose_fit.photometric import COARSE_TO_FINE, FINE, align
 from gausslite.render.rasterizer import Rendering
+from gausslite_poses.photometric import COARSE_TO_FINE, FINE, align
 
 RenderMap = Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]
 """Renders a map from T_world_camera."""
@@ -174,7 +174,8 @@ def _refined(
 
 def blurred_luminance(rgb: Num[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     """Return the luminance of colours from 0 to 255, from 0 to 1, as `texture_correlation` compares it."""
-    return cv2.GaussianBlur(rgb @ _LUMINANCE, (0, 0), _BLUR_PX)
+    blurred: Float32[ndarray, "h w"] = cv2.GaussianBlur(rgb @ _LUMINANCE, (0, 0), _BLUR_PX)
+    return blurred
 
 
 def texture_correlation(

@@ -1,1 +1,1 @@
-"""Readers of recordings that apps and cameras export: Record3D and ZED."""
+"""Readers of recordings in other layouts than that of TUM: 7-Scenes, Replica, Record3D, ZED."""

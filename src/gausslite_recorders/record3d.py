@@ -29,6 +29,7 @@ from gausslite.datasets.folder import FolderReader, FolderSource, estimate_up, i
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.file_formats import foreign_file
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 
@@ -48,7 +49,9 @@ class Record3dFiles:
         try:
             self._zip = zipfile.ZipFile(path)
         except (zipfile.BadZipFile, OSError) as error:
-            raise DatasetError(f"{path}: expected an .r3d file, which is a ZIP; {error}") from None
+            raise DatasetError(
+                f"{path}: expected an .r3d file, which is a ZIP; {foreign_file(path) or error}"
+            ) from None
         weakref.finalize(self, self._zip.close)
 
     def path_of(self, name: str) -> str:

@@ -13,9 +13,10 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import example_camera_file, read_folder_camera
 from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
-from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader, NumberedFolderSource, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader, is_lost, pose_from_quaternion
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite_recorders.numbered_folder import NumberedFolderSource
 
 _MILLIMETRES = DepthUnits(per_metre=1000.0)
 _COLOUR_NAME = re.compile(r"left(\d{6})\.png")

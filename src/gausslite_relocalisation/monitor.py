@@ -14,14 +14,16 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame, FrameId
-from gausslite.domain.pose import orthonormal
+from gausslite.domain.pose import inverse, orthonormal
 from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
 from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.seeding import RenderedView
 from gausslite.mission.localisation_monitor import Admission, LocalisationMonitor, LocalisationState
 from gausslite.mission.prior_map import PriorMap
+from gausslite_calibration.live_check import LiveCheck
+from gausslite_places.verification import verify
 from gausslite_relocalisation.agreement import Agreement, compare, is_another_place
-from gausslite_relocalisation.motion import OdometrySteps
+from gausslite_relocalisation.motion import Doubt, OdometrySteps
 from gausslite_relocalisation.place_search import PlaceSearch
 
 _EARLIER = 3
@@ -38,9 +40,14 @@ _CONTRADICTION: Final = "its images contradict the map"
 class FrameMonitor(LocalisationMonitor):
     """Judges the frames of one mission. Not thread-safe."""
 
-    def __init__(self, prior: PriorMap | None = None) -> None:
-        """prior: the earlier map that the mission continues."""
+    def __init__(self, prior: PriorMap | None = None, in_background: bool | None = None) -> None:
+        """prior: the earlier map that the mission continues.
+
+        in_background: whether live frames are compared with each other there; None: they were compared before.
+        """
         self._prior = prior
+        self._check = None if in_background is None else LiveCheck(in_background)
+        self._refusal = ""
         self._localisation = LocalisationState.TRACKED
         self._steps = OdometrySteps()
         self._waiting: deque[Frame] = deque(maxlen=_MAX_WAITING)
@@ -48,7 +55,7 @@ class FrameMonitor(LocalisationMonitor):
         self._search: PlaceSearch | None = None
         self._earlier: list[Frame] = []
         self._newest: Frame | None = None
-        self._cause, self._is_gap = "", False
+        self._cause, self._goes_on = "", False
         # of the present doubt: its first frame; frames so far; the latest ones in a row that agree, or leave it open
         self._since = self._doubtful = self._agreed = self._open = 0
         self._doubts = self._found = 0
@@ -56,7 +63,7 @@ class FrameMonitor(LocalisationMonitor):
     @property
     def localisation(self) -> LocalisationState:
         """The state after the latest frame."""
-        return self._localisation
+        return max(self._localisation, LocalisationState.DOUBTFUL) if self._refusal else self._localisation
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -67,16 +74,24 @@ class FrameMonitor(LocalisationMonitor):
             now = f"the robot's place is {name} since frame {self._since}: {self._cause}; its frames are not mapped"
         elif self._doubts:
             before = f"the robot's place was doubtful {self._doubts} times, and {self._found} times found in the map"
-        return tuple(filter(None, (now, before)))
+        return (*(() if self._check is None else self._check.notes), *filter(None, (now, before)))
 
     def admit(self, frame: Frame, mapper: GaussianMapper) -> Admission:
         """Return which frames are to be mapped now; see `LocalisationMonitor.admit`."""
         self._newest = frame
         self._earlier = [view.keyframe.frame for view in mapper.store.window[-_EARLIER:]]
-        cause, is_gap = self._steps.add(frame)
-        if cause:
-            self._begin_doubt(frame, cause, is_gap)
+        doubt = self._steps.add(frame)
+        if doubt is not None:
+            self._begin_doubt(frame, doubt)
             self._begin_odometry()
+            if self._check is not None:
+                self._check.restart()
+        self._refusal = "" if self._check is None else self._check.refusal(frame)
+        if self._refusal:
+            # no place is to be found for poses that are no poses of the camera
+            self._begin_odometry()
+            self._localisation = LocalisationState.TRACKED
+            return Admission(reason=self._refusal)
         if self._localisation is LocalisationState.TRACKED:
             return Admission((frame,))
         return self._admit_doubtful(frame, mapper)
@@ -88,7 +103,8 @@ class FrameMonitor(LocalisationMonitor):
         if compare(frame, view.rendered, self._earlier) is not Agreement.CONTRADICTS:
             return True
         if not is_recovered and self._newest is not None:
-            self._begin_doubt(frame, _CONTRADICTION)
+            self._begin_doubt(frame, Doubt(_CONTRADICTION))
+            self._steps.begin(is_followed=False)
             self._doubtful = 1
             self._waiting.append(self._newest)
         return False
@@ -109,20 +125,22 @@ class FrameMonitor(LocalisationMonitor):
         agreement = self._compare(frame, mapper)
         self._agreed = self._agreed + 1 if agreement is Agreement.AGREES else 0
         self._open = self._open + 1 if agreement is Agreement.UNKNOWN else 0
-        self._is_gap &= agreement is not Agreement.CONTRADICTS
-        # after a mere gap, a place that was not mapped is no sign of another odometry
-        goes_on = self._is_gap and self._open >= _LOST_AFTER
+        self._goes_on &= agreement is not Agreement.CONTRADICTS
+        # of an odometry that goes on, a place that was not mapped is no sign of another place
+        goes_on = self._goes_on and self._open >= _LOST_AFTER
         if goes_on or self._agreed >= _AGREEING[self._localisation]:
             return self._end_doubt(frame)
         if self._waiting and is_another_place(frame, self._waiting[-1]):
             self._begin_odometry()
+        T_map_odometry = self._by_images(frame, mapper)
+        if T_map_odometry is not None:
+            return self._end_doubt(frame, T_map_odometry)
         self._doubtful += 1
         if self._doubtful >= _LOST_AFTER:
             self._localisation = LocalisationState.LOST
             self._search = self._search or PlaceSearch(mapper, self._prior)
             T_map_odometry = self._search.offer(frame)
             if T_map_odometry is not None:
-                self._found += 1
                 return self._end_doubt(frame, T_map_odometry)
         self._waiting.append(frame)
         return Admission()
@@ -135,13 +153,23 @@ class FrameMonitor(LocalisationMonitor):
             rendered = RenderedView.from_rendering(mapper.render(frame.camera, placed.T_world_camera, frame.motion))
         return compare(placed, rendered, self._earlier)
 
-    def _begin_doubt(self, frame: Frame, cause: str, is_gap: bool = False) -> None:
+    def _by_images(self, frame: Frame, mapper: GaussianMapper) -> Float64[ndarray, "4 4"] | None:
+        """Return T_map_odometry of an odometry whose jump the images have measured, if the map shows the same."""
+        T_before_now = self._steps.T_before_now
+        if T_before_now is None or self._goes_on or not mapper.count:
+            return None
+        T = mapper.poses.T_corrected_odometry
+        T_map_now = T_before_now if T is None else T @ T_before_now
+        found = verify(mapper.render, frame, orthonormal(T_map_now @ frame.T_world_camera))
+        return orthonormal(found.T_world_camera @ inverse(frame.T_world_camera)) if found.is_accepted else None
+
+    def _begin_doubt(self, frame: Frame, doubt: Doubt) -> None:
         self._agreed = self._open = 0
         if self._localisation is LocalisationState.TRACKED:
             self._localisation = LocalisationState.DOUBTFUL
             self._since, self._doubtful, self._doubts = frame.index, 0, self._doubts + 1
-            self._cause, self._is_gap = cause, is_gap
-        self._is_gap &= is_gap
+            self._cause = doubt.cause
+        self._goes_on = doubt.goes_on
 
     def _begin_odometry(self) -> None:
         """Forget the frames of another odometry: what places one does not place the other."""
@@ -154,5 +182,7 @@ class FrameMonitor(LocalisationMonitor):
         self._recovered = {waited.id for waited in frames}
         self._waiting.clear()
         self._search = None
+        self._steps.begin(is_followed=True)
+        self._found += T_map_odometry is not None
         self._localisation = LocalisationState.TRACKED
         return Admission(frames, T_map_odometry)

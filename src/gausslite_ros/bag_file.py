@@ -9,11 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from gausslite.domain.errors import DatasetError
-from gausslite_ros.bag_parts import SUFFIXES, has_bag, is_bag, missing_parts, open_parts, repair_of
+from gausslite_ros.bag_parts import SUFFIXES, foreign_part, has_bag, is_bag, missing_parts, open_parts, repair_of
+from gausslite_ros.mcap_file import Message
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -165,7 +167,7 @@ class _Clock:
 
 
 class BagFile:
-    """An opened bag with random access to its messages.
+    """An opened bag with random access to its messages, from any thread.
 
     Only the types of topics that are read are defined, so that a damaged definition of another type does no harm.
     Raises DatasetError for a bag that cannot be read, and without the extra `ros`.
@@ -174,6 +176,8 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._stores: dict[str, Typestore] = {}
+        # the readers share the position in their file between all messages
+        self._reading = RLock()
         with self._readable():
             self._parts = open_parts(path)
             for part in self._parts:
@@ -256,7 +260,7 @@ class BagFile:
         start_ns = key.recorded_ns
         with self._readable(key.topic):
             wanted = [connection for part, connection in self._connections[key.topic] if part == key.part]
-            at_time = self._parts[key.part].messages(wanted, start_ns, start_ns + 1)
+            at_time = self._one_by_one(self._parts[key.part].messages(wanted, start_ns, start_ns + 1))
             for rank, (connection, _, data) in enumerate(at_time):
                 if rank == key.rank:
                     return self._deserialise(connection, data)
@@ -267,8 +271,17 @@ class BagFile:
         for number, part in enumerate(self._parts):
             wanted = [connection for found, connection in self._connections.get(topic, ()) if found == number]
             if wanted:
-                for connection, time_ns, data in part.messages(wanted):
+                for connection, time_ns, data in self._one_by_one(part.messages(wanted)):
                     yield number, connection, time_ns, data
+
+    def _one_by_one(self, messages: Iterator[Message]) -> Iterator[Message]:
+        """Yield the messages, each of which is read while no other thread reads."""
+        while True:
+            with self._reading:
+                message = next(messages, None)
+            if message is None:
+                return
+            yield message
 
     def _deserialise(self, connection: Connection, data: bytes) -> Any:
         if data.startswith(_ZSTD):
@@ -283,8 +296,9 @@ class BagFile:
 
     def _store_of(self, connection: Connection) -> Typestore:
         """Return the definition of a topic's message type in the bag, else the standard one."""
-        if connection.topic not in self._stores:
-            self._stores[connection.topic] = _typestore(connection)
+        with self._reading:
+            if connection.topic not in self._stores:
+                self._stores[connection.topic] = _typestore(connection)
         return self._stores[connection.topic]
 
     @contextmanager
@@ -292,10 +306,16 @@ class BagFile:
         """Raise DatasetError for any error of the reader: damaged files cause errors of many types in it."""
         try:
             yield
-        except (DatasetError, GeneratorExit):
+        except GeneratorExit:
             raise
+        except DatasetError as error:
+            if not topic and (foreign := foreign_part(self._path)):
+                raise DatasetError(f"{self._path}: expected a readable bag, got {foreign}") from None
+            raise error
         except Exception as error:
             location = f"{self._path}: {topic}" if topic else str(self._path)
+            if not topic and (foreign := foreign_part(self._path)):
+                raise DatasetError(f"{location}: expected a readable bag, got {foreign}") from None
             reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
             advice = "" if topic else f"; {repair_of(self._path)}"
             raise DatasetError(f"{location}: expected a readable bag; {reason}{advice}") from None

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import yaml
 
 from gausslite.domain.errors import DatasetError
+from gausslite.domain.file_formats import foreign_file
 from gausslite_ros.mcap_file import McapFile, Message
 
 if TYPE_CHECKING:
@@ -64,6 +65,19 @@ def repair_of(path: Path) -> str:
     """Return how to repair a bag that cannot be read."""
     kinds = sorted(filter(None, map(kind_of, path.iterdir() if path.is_dir() else (path,))))
     return _REPAIRS[kinds[0]] if kinds else "expected files of a bag in it"
+
+
+_FORMAT_OF = {".bag": "a bag of ROS 1", ".mcap": "an MCAP file", ".db3": "a SQLite database"}
+
+
+def foreign_part(path: Path) -> str:
+    """Return what a file of the bag is, by its first bytes, in place of what its name says; empty if it is that."""
+    files = [file for file in sorted(path.iterdir()) if kind_of(file)] if path.is_dir() else [path]
+    for file in files:
+        found = foreign_file(file)
+        if found and found != _FORMAT_OF.get(kind_of(file)):
+            return f"{found} ({file.name})"
+    return ""
 
 
 def is_bag(path: Path) -> bool:

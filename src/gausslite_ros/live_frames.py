@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera
+from gausslite.datasets.folder import MAX_POSE_GAP_S
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import ClockJumps, Frame
@@ -20,7 +21,7 @@ from gausslite_ros.bag_file import BagOptions
 from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose, require_own_camera, same_camera
 from gausslite_ros.messages import TransformMessage, camera_of, frame_name, stamp_ns
 from gausslite_ros.topics import camera_name, is_aligned
-from gausslite_ros.transforms import MAX_GAP_S, TransformWindow, transforms_of
+from gausslite_ros.transforms import TransformWindow, transforms_of
 
 MAX_WAIT_S = 1.5
 """Localisation nodes publish map → odom once a second."""
@@ -69,7 +70,7 @@ class LiveFrames:
         self._colour_info: Any = None
         self._depth_info: Any = None
         self._converter: FrameConverter | None = None
-        self._transforms = TransformWindow(max_wait_s + 2 * MAX_GAP_S)
+        self._transforms = TransformWindow(max_wait_s + 2 * MAX_POSE_GAP_S)
         self._pending: deque[_Pending] = deque()
         self._depths: list[tuple[int, int, Any]] = []
         self._depths_received = 0

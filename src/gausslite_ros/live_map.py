@@ -13,9 +13,9 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.wire.map_follower import FollowedMap
 from gausslite_export.free_cells import points_before_surface
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels, planar_grid
+from gausslite_link.map_follower import FollowedMap
 
 _WIDTH_PX = 80
 _RANGE_M = 5.0

@@ -14,7 +14,7 @@ from rosidl_runtime_py.utilities import get_message
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
-from gausslite.wire.robot import AgentLink
+from gausslite_link.agent_link import AgentLink
 from gausslite_ros.robot_session import Delivery, NodeParameters, Outgoing, RobotSession, publications
 
 _QOS = {

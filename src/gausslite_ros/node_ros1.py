@@ -16,7 +16,7 @@ from roslib.message import get_message_class
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
-from gausslite.wire.robot import AgentLink
+from gausslite_link.agent_link import AgentLink
 from gausslite_ros.outgoing import Fields
 from gausslite_ros.robot_session import Delivery, NodeParameters, Outgoing, RobotSession, publications
 

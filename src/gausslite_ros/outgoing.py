@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.datasets.folder import quat_xyzw
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite.wire.robot import AgentSnapshot, SentFrames
+from gausslite_link.agent_link import AgentSnapshot, SentFrames
 from gausslite_ros.live_frames import LiveCounters
 from gausslite_ros.live_map import Grid
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausslite.domain.errors import InvalidInputError, MissingPluginError
-from gausslite.wire.robot import AgentLink, LinkSettings
 from gausslite.wire.security import Tls
+from gausslite_link.agent_link import AgentLink, LinkSettings
 from gausslite_ros.bag_file import BagOptions
 from gausslite_ros.live_frames import LiveFrames
 from gausslite_ros.outgoing import (

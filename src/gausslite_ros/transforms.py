@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder import PoseTrack
+from gausslite.datasets.folder import MAX_POSE_GAP_S, PoseTrack
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import inverse
 from gausslite_ros.messages import TransformMessage, frame_name, quaternion_of, stamp_ns, translation_of
 
-MAX_GAP_S = 1.0
-"""Longest time between two transforms to interpolate: slow localisation nodes publish map → odom once a second."""
 _MAX_LAG_S = 0.010
 _MAX_DEPTH = 64
 _MAX_LISTED = 12
@@ -62,20 +60,20 @@ def seconds(times_ns: Iterable[int]) -> Float64[ndarray, " n"]:
 class TransformTree:
     """Frames with the pose of each in its parent frame, static or over time.
 
-    Between two stamps at most MAX_GAP_S apart, a pose is interpolated (lerp and slerp). A transform of both kinds is
+    Between two stamps at most MAX_POSE_GAP_S apart, a pose is interpolated (lerp and slerp). One of both kinds is
     static. Those that are no pose are left out: with NaN, infinity, or a quaternion of zeros.
     """
 
     def __init__(self, transforms: Iterable[Transform]) -> None:
         grouped: dict[tuple[str, str], list[Transform]] = {}
-        self._left_out: dict[tuple[str, str], int] = {}
+        self._left_out: dict[tuple[str, str], list[int]] = {}
         self._restated: list[str] = []
         for transform in transforms:
             link = transform.child, transform.parent
             if is_pose(transform.translation_m, transform.quat_xyzw):
                 grouped.setdefault(link, []).append(transform)
             else:
-                self._left_out[link] = self._left_out.get(link, 0) + 1
+                self._left_out.setdefault(link, []).append(transform.time_ns or 0)
         self._tracks: dict[str, dict[str, PoseTrack]] = {}
         self._static: set[tuple[str, str]] = set()
         self._known_chains: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
@@ -85,7 +83,8 @@ class TransformTree:
                 self._static.add((child, parent))
             if any(_differ(transform, fixed[-1]) for transform in fixed):
                 self._restated.append(f"{parent} → {child}")
-            track = _track(f"tf {parent} → {child}", fixed[-1:] or measured)
+            lost_s = seconds(sorted(self._left_out.get((child, parent), ())))
+            track = _track(f"tf {parent} → {child}", fixed[-1:] or measured, lost_s)
             self._tracks.setdefault(child, {})[parent] = track
 
     @property
@@ -96,7 +95,7 @@ class TransformTree:
     @property
     def notes(self) -> tuple[str, ...]:
         """Messages on transforms that are no pose, and on static ones that are stated in two ways."""
-        links = [f"{count} {parent} → {child}" for (child, parent), count in sorted(self._left_out.items())]
+        links = [f"{len(times)} {parent} → {child}" for (child, parent), times in sorted(self._left_out.items())]
         left_out = "left out transforms with NaN, infinity or a quaternion of zeros"
         restated = "static transforms are stated in several ways, the last one is used"
         found = ((left_out, links), (restated, self._restated))
@@ -207,14 +206,15 @@ def track_of(location: str, poses: Mapping[int, tuple[tuple[float, ...], tuple[f
     times_ns = sorted(poses)
     translations_m = np.array([poses[time_ns][0] for time_ns in times_ns], np.float64)
     quats_xyzw = np.array([poses[time_ns][1] for time_ns in times_ns], np.float64)
-    return PoseTrack(location, seconds(times_ns), translations_m, quats_xyzw, MAX_GAP_S, _MAX_LAG_S)
+    return PoseTrack(location, seconds(times_ns), translations_m, quats_xyzw, MAX_POSE_GAP_S, _MAX_LAG_S)
 
 
-def _track(location: str, measured: list[Transform]) -> PoseTrack:
+def _track(location: str, measured: list[Transform], lost_s: Float64[ndarray, " m"]) -> PoseTrack:
     if measured[0].time_ns is None:
         pose = np.array([measured[0].translation_m]), np.array([measured[0].quat_xyzw])
-        return PoseTrack(location, np.zeros(1), *pose, MAX_GAP_S, np.inf)
-    return track_of(location, {t.time_ns: (t.translation_m, t.quat_xyzw) for t in measured if t.time_ns is not None})
+        return PoseTrack(location, np.zeros(1), *pose, MAX_POSE_GAP_S, np.inf)
+    poses = {t.time_ns: (t.translation_m, t.quat_xyzw) for t in measured if t.time_ns is not None}
+    return replace(track_of(location, poses), lost_s=lost_s)
 
 
 _MAX_FRAMES = 10_000

@@ -80,7 +80,7 @@ class _MappedObjects:
     """The objects of a finished map as landmarks, all of them confirmed; a landmark's number is its position."""
 
     def __init__(self, objects: Sequence[ObjectLandmark]) -> None:
-        self._landmarks = [_landmark(number, found) for number, found in enumerate(objects)]
+        self._landmarks = [mapped_landmark(number, found) for number, found in enumerate(objects)]
 
     def seen(self, name: str) -> list[Landmark]:
         """Return the objects that a name of the graph means, by noun and synonym."""
@@ -96,7 +96,7 @@ class _MappedObjects:
         return self.seen(name)
 
 
-def _landmark(number: int, found: ObjectLandmark) -> Landmark:
+def mapped_landmark(number: int, found: ObjectLandmark) -> Landmark:
     """Return a landmark whose cells fill the object's box."""
     low_m, high_m = np.array(found.extent_m.min_m), np.array(found.extent_m.max_m)
     steps = np.clip(np.ceil((high_m - low_m) / _BOX_STEP_M).astype(int) + 1, 2, _MAX_STEPS)

@@ -16,6 +16,8 @@ _MARGIN_PX = 2
 _SHARPNESS = 0.4
 """Mip level bias towards finer levels: interpolation blurs more than the mean over a square does."""
 _MAX_TAPS_LOG2 = 5
+_PLAIN, _PLAIN_TAPS = 16.0, 1 / 3
+"""A texture whose finest and coarsest levels differ by less (root mean square, of 255) needs this share of taps."""
 _CHUNK = 2048
 """Footprints of one look-up: its coordinates stay in the processor's cache."""
 
@@ -33,6 +35,7 @@ class TextureAtlas:
         self._tops = np.array(tops, np.float32)
         self._pitches = np.array(pitches, np.float32)
         height = max(pitches[0] * self._rows, int(tops[-1]) + pitches[-1] * self._rows)
+        self._taps = np.ones(len(textures), np.float32)
         self._image = np.zeros((height, (pitches[0] + pitches[1]) * self._columns, 3), np.uint8)
         for i, texture in enumerate(textures):
             self._place(i, texture.rgb)
@@ -46,11 +49,12 @@ class TextureAtlas:
     ) -> Float32[ndarray, "n 3"]:
         """Return mean colours 0 to 255 over parallelograms round these texture coordinates, with these sides.
 
-        taps: least number of look-ups along the shorter side, if that is longer than so many texels.
+        taps: least number of look-ups along the shorter side, if that is longer than so many texels; plain textures
+        need fewer.
         """
         across, down = sides
         widths, heights = SIDE_PX * np.hypot(sides[..., 0], sides[..., 1])
-        cells = np.maximum(np.minimum(widths, heights) / taps, 1.0)
+        cells = np.maximum(np.minimum(widths, heights) / (taps * self._taps[texture]), 1.0)
         counts_log2 = [
             np.clip(np.ceil(np.log2(np.maximum(lengths / cells, 0.5)) - 0.25), 0, _MAX_TAPS_LOG2).astype(np.int64)
             for lengths in (widths, heights)
@@ -86,6 +90,10 @@ class TextureAtlas:
 
     def _place(self, i: int, rgb: UInt8[ndarray, "s s 3"]) -> None:
         row, column = divmod(i, self._columns)
+        coarse = cv2.resize(rgb, (SIDE_PX >> (_LEVELS - 1),) * 2, interpolation=cv2.INTER_AREA)
+        fine = cv2.resize(coarse, (SIDE_PX, SIDE_PX)).astype(np.float32)
+        if np.square(rgb - fine).mean() < _PLAIN**2:
+            self._taps[i] = _PLAIN_TAPS
         for level in range(_LEVELS):
             side = SIDE_PX >> level
             small = rgb if level == 0 else cv2.resize(rgb, (side, side), interpolation=cv2.INTER_AREA)

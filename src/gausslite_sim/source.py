@@ -29,6 +29,7 @@ from gausslite_sim.instance_regions import InstanceImageCache, InstanceRegion
 from gausslite_sim.moving_box import box_centre_m, with_box
 from gausslite_sim.odometry_drift import drifting_poses
 from gausslite_sim.ray_camera import RayCamera
+from gausslite_sim.read_ahead import ReadAhead
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
 from gausslite_sim.scene import HomeScene, ray_caster_factory
 from gausslite_sim.sensor import colour_image, noisy_colour, noisy_depth
@@ -125,18 +126,10 @@ class SimulatedHome(Source):
         require_position(self.name, i, len(self))
         if size is not None:
             require_size("size", size)
-        settings, home = self._settings, self._home
-        view = self._apply_exposure(self._render(i), i)
-        if settings.noise > 0:
-            rng = np.random.default_rng([settings.seed, settings.trajectory, i])
-            rgb = noisy_colour(view, home.plan.sensor, settings.noise, rng)
-            depth_m = noisy_depth(view, home.plan.sensor, settings.noise, rng)
-        else:
-            rgb, depth_m = colour_image(view.rgb), view.depth_m
-        image = resize_rgbd(RgbdImage(rgb, depth_m, self._camera), size)
+        image = resize_rgbd(self._images(i), size)
         return Frame(
             i,
-            round(self._times_s[i] * 1e9) if settings.speed_deg_s else i * 10**9 // _RATE_HZ,
+            round(self._times_s[i] * 1e9) if self._settings.speed_deg_s else i * 10**9 // _RATE_HZ,
             image.rgb,
             image.depth_m,
             image.camera,
@@ -194,6 +187,20 @@ class SimulatedHome(Source):
         numbers = np.arange(len(self), dtype=np.float64)
         turn_per_frame_deg = np.degrees(Trajectory(numbers, self._poses).angular_speeds_rad_s().mean())
         return max(float(turn_per_frame_deg), 1e-6) / speed_deg_s
+
+    @cached_property
+    def _images(self) -> ReadAhead[RgbdImage]:
+        return ReadAhead(self._record, len(self))
+
+    def _record(self, i: int) -> RgbdImage:
+        """Return the images of frame i as the simulated camera records them."""
+        settings, home = self._settings, self._home
+        view = self._apply_exposure(self._render(i), i)
+        if settings.noise == 0:
+            return RgbdImage(colour_image(view.rgb), view.depth_m, self._camera)
+        rng = np.random.default_rng([settings.seed, settings.trajectory, i])
+        rgb = noisy_colour(view, home.plan.sensor, settings.noise, rng)
+        return RgbdImage(rgb, noisy_depth(view, home.plan.sensor, settings.noise, rng), self._camera)
 
     def _render(self, i: int) -> View:
         settings, scene = self._settings, self._home.scene

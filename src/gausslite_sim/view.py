@@ -9,21 +9,24 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
+from gausslite_sim.pixel_parts import PixelParts, parts_of, whole_pixels
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.scene import NO_HIT, Hits, HomeScene
-from gausslite_sim.shading import HEAD_ON, Surface, add_reflections, diffuse_colour, uv_step
+from gausslite_sim.shading import HEAD_ON, Surface, add_reflections, uv_step
 from gausslite_sim.textures import SIDE_PX
 
 _UV_TOLERANCE = 0.15
 """Greatest error of a predicted texture coordinate, as a share of the pixel's footprint."""
 _LIGHT_TOLERANCE = 0.05
 """Greatest difference of the light in a pixel's centre and at its border, about 1 under a lamp."""
-_REFLECTION_TOLERANCE = 6.0
+_REFLECTION_TOLERANCE = 12.0
 """Greatest difference of the reflections in two neighbouring pixels, of 255."""
 _SPREAD = 32.0
 """Standard deviation of the first rays' colours, of 255, from which a pixel gets all rays."""
 _TAPS = 6
 """Texture look-ups along the shorter side of a pixel without an edge."""
+_PART_TAPS = 3
+"""The same for a part of a pixel with an edge."""
 _RAYS = 64
 _ORDER = np.argsort(np.arange(_RAYS) % 2 == 0, kind="stable")
 PIXEL_RAYS_PX = ((np.stack([_ORDER, 19 * _ORDER % _RAYS], axis=1) + 0.5) / _RAYS - 0.5).astype(np.float32)
@@ -49,16 +52,10 @@ def render_view(scene: HomeScene, camera: RayCamera, rays_px: Float32[ndarray, "
 
     rays_px: a part of PIXEL_RAYS_PX, if the mean of views from nearby poses is wanted.
     """
-    shape, pixels = camera.shape, camera.pixels()
-    columns, rows = camera.centres(pixels)
-    rays = camera.rays(pixels, columns, rows)
-    hits = scene.cast(rays.origins_m, rays.directions)
-    surface = Surface.of(scene, hits, rays.directions)
-    turns = (camera.rays(pixels, columns + 0.5, rows), camera.rays(pixels, columns, rows + 0.5))
-    steps = np.stack([uv_step(scene, hits, rays.directions, 2 * (t.directions - rays.directions)) for t in turns])
-    rgb = scene.atlas.mean(scene.triangles.texture[hits.triangle], surface.uv, steps, _TAPS) * surface.light
-    matt = rgb.copy()
-    add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
+    shape, parts = camera.shape, whole_pixels(scene, camera)
+    hits, surface = parts.hits, Surface.of(scene, parts.hits, parts.rays.directions)
+    steps = _steps(scene, camera, parts)
+    rgb, matt = _colours(scene, parts, surface, steps, _TAPS)
     is_hit = hits.triangle != NO_HIT
     item = np.where(is_hit, scene.triangles.item[hits.triangle], NO_HIT)
     gloss = np.where(is_hit, scene.triangles.gloss[hits.triangle], np.float32(0))
@@ -83,6 +80,24 @@ def render_instances(
     triangle = scene.cast(rays.origins_m, rays.directions).triangle
     item: Int64[ndarray, " n"] = np.where(triangle == NO_HIT, NO_HIT, scene.triangles.item[triangle])
     return item.reshape(ray_camera.shape)
+
+
+def _steps(scene: HomeScene, camera: RayCamera, parts: PixelParts) -> Float32[ndarray, "2 n 2"]:
+    """Return the change of the texture coordinates from pixel to pixel, to the right and down."""
+    at, directions = parts, parts.rays.directions
+    turns = (camera.rays(at.pixels, at.columns + 0.5, at.rows), camera.rays(at.pixels, at.columns, at.rows + 0.5))
+    return np.stack([uv_step(scene, at.hits, directions, 2 * (t.directions - directions)) for t in turns])
+
+
+def _colours(
+    scene: HomeScene, parts: PixelParts, surface: Surface, steps: Float32[ndarray, "2 n 2"], taps: int
+) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, "n 3"]]:
+    """Return the mean colours over parts of pixels, with reflections and without."""
+    sides, texture = steps * parts.sides[:, :, None], scene.triangles.texture[parts.hits.triangle]
+    matt = scene.atlas.mean(texture, surface.uv, sides, taps) * surface.light
+    rgb = matt.copy()
+    add_reflections(scene, rgb, parts.hits, parts.rays.directions, parts.rays.origins_m)
+    return rgb, matt
 
 
 def _edges(
@@ -133,26 +148,25 @@ def _ray_means(
 ) -> Float32[ndarray, "n 3"]:
     """Return the mean colours of half of the rays in each pixel, or of all where the colours of the half differ."""
     half = max(1, len(rays_px) // 2)
-    few = _ray_colours(scene, camera, pixels, rays_px[:half])
-    means: Float32[ndarray, "n 3"] = few.mean(axis=1)
-    uneven = np.flatnonzero(few.std(axis=1).max(axis=1) > _SPREAD)
-    more = _ray_colours(scene, camera, pixels[uneven], rays_px[half:])
-    means[uneven] = (few[uneven].sum(axis=1) + more.sum(axis=1)) / np.float32(len(rays_px))
+    share = np.float32(half / len(rays_px))
+    means, deviations = _mean_of_parts(scene, camera, pixels, rays_px[:half])
+    uneven = np.flatnonzero(deviations > _SPREAD)
+    if len(uneven) and share < 1:
+        more, _ = _mean_of_parts(scene, camera, pixels[uneven], rays_px[half:])
+        means[uneven] = share * means[uneven] + (1 - share) * more
     return means
 
 
-def _ray_colours(
-    scene: HomeScene, camera: RayCamera, pixels: Int64[ndarray, " n"], offsets: Float32[ndarray, "k 2"]
-) -> Float32[ndarray, "n k 3"]:
-    """Return the colours of rays through each pixel's centre plus these offsets."""
-    columns, rows = (
-        (centre[:, None] + offset).ravel() for centre, offset in zip(camera.centres(pixels), offsets.T, strict=True)
-    )
-    rays = camera.rays(np.repeat(pixels, len(offsets)), columns, rows)
-    hits = scene.cast(rays.origins_m, rays.directions)
-    surface = Surface.of(scene, hits, rays.directions)
-    # half the geometric mean of a ray's footprints across and along the slope: means of many rays blur by themselves
-    width_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(4 * _RAYS * np.maximum(surface.facing, 0.05))
-    rgb = diffuse_colour(scene, hits, surface, width_m)
-    add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
-    return rgb.reshape(len(pixels), len(offsets), 3)
+def _mean_of_parts(
+    scene: HomeScene, camera: RayCamera, pixels: Int64[ndarray, " n"], rays_px: Float32[ndarray, "k 2"]
+) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, " n"]]:
+    """Return the mean colours of rays in each pixel, and the largest standard deviation of a channel."""
+    if not len(pixels):
+        return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    parts, shares = parts_of(scene, camera, pixels, rays_px, 1 / _RAYS)
+    surface = Surface.of(scene, parts.hits, parts.rays.directions)
+    rgb, _ = _colours(scene, parts, surface, _steps(scene, camera, parts), _PART_TAPS)
+    starts = np.flatnonzero(np.diff(parts.pixels, prepend=-1))
+    sums = np.add.reduceat(np.concatenate([rgb, rgb * rgb], axis=1) * shares[:, None], starts, axis=0)
+    means: Float32[ndarray, "n 3"] = sums[:, :3].copy()
+    return means, np.sqrt(np.maximum(sums[:, 3:] - means * means, 0)).max(axis=1)

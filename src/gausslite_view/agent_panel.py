@@ -11,7 +11,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_task import object_from_message
-from gausslite.wire.map_follower import MapFollower
+from gausslite_link.map_follower import MapFollower
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
 from gausslite_view.decoding import camera_view_from_message

@@ -18,7 +18,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox, oriented_box
 from gausslite.domain.pose import upward_axis
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.wire.map_follower import FollowedMap
+from gausslite_link.map_follower import FollowedMap
 
 NO_AGENT = -1
 

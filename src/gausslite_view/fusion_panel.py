@@ -10,8 +10,8 @@ from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import GaussLiteError
 from gausslite.process import size_text
 from gausslite.wire.clients import Export, FusionClient
-from gausslite.wire.map_follower import MapFollower
 from gausslite_evaluation.compare import map_purpose
+from gausslite_link.map_follower import MapFollower
 from gausslite_view.cameras import TeamCameras, TeamKeyframes
 from gausslite_view.contents import ViewContents, followed_contents
 from gausslite_view.map_page import MapPage, text_html

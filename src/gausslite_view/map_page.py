@@ -104,7 +104,11 @@ class MapPage:
 
     def show_problem(self, text: str) -> None:
         """Show why the page is out of date; an empty text removes it."""
-        shown = text_html([f"Not up to date: {text}"]) if text else ""
+        self.show_note(f"Not up to date: {text}" if text else "")
+
+    def show_note(self, text: str) -> None:
+        """Show a line above all else; an empty text removes it."""
+        shown = text_html([text]) if text else ""
         if self._problem.content != shown:
             self._problem.content = shown
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
@@ -23,10 +23,11 @@ from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.schedule import ScheduledTaskMapper
 from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.pages import BeginView
 from gausslite.process import print_message
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
-from gausslite_view.map_page import MapPage, TaskField
+from gausslite_view.map_page import MapPage, TaskField, text_html
 from gausslite_view.pages import open_page
 from gausslite_view.plots import HistoryPlot, QualityPlot
 from gausslite_view.pointing import PointingPanel
@@ -35,6 +36,7 @@ _INTERVAL_S = 1.0
 _MOST_SHARE = 0.2
 """Of the mission's time that drawing takes at most."""
 _NS_PER_S = 1e9
+_PREPARING = "The recording is read, and what it does not state is estimated; the map appears with the first frame."
 
 
 _Result = TypeVar("_Result")
@@ -102,7 +104,9 @@ class MissionView:
         self._requests = MissionRequests(mission)
         gui = page.server.gui
         with gui.add_folder("Task", order=0):
-            self._task = TaskField(gui, self._requests.assign, "" if mission.graph is None else mission.graph.text)
+            self._current = gui.add_html("")
+            TaskField(gui, self._requests.assign, "" if mission.graph is None else mission.graph.text)
+        self._show_task()
         self._pointing = PointingPanel(page, self._requests)
         self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):
@@ -113,6 +117,7 @@ class MissionView:
     def update(self, outcome: FrameOutcome) -> None:
         """Answer the page after a frame; draw the map if the next drawing is due and nobody points."""
         self._requests.answer()
+        self._show_task()
         now_s = time.monotonic()
         if now_s < self._due_s or not outcome.gaussians or self._page.is_held:
             return
@@ -130,10 +135,16 @@ class MissionView:
         ended_s = time.monotonic()
         self._due_s = max(now_s + _INTERVAL_S, ended_s + (ended_s - now_s) * (1 / _MOST_SHARE - 1))
 
-    def close(self) -> None:
-        """Refuse what the page still asks, and end it."""
+    def _show_task(self) -> None:
+        """Show the sentence that is mapped for: the field may hold one that was refused."""
+        graph = self._mission.graph
+        shown = text_html([f"task: {graph.text}" if graph is not None and graph.text else "no task"])
+        if self._current.content != shown:
+            self._current.content = shown
+
+    def end(self) -> None:
+        """Refuse what the page still asks."""
         self._requests.end()
-        self._page.close()
 
     def _contents(self) -> ViewContents:
         mapper, graph = self._mission.mapper, self._mission.graph
@@ -154,17 +165,21 @@ class MissionView:
 
 
 @contextmanager
-def mission_view(port: int, mission: ScheduledTaskMapper) -> Iterator[Callable[[FrameOutcome], None]]:
-    """Serve a page during a mission; yield what to call after each frame.
-
-    Raises InvalidInputError for a port in use.
-    """
-    view = MissionView(page := open_page(port, "GaussLite map"), mission)
-    try:
+def mission_view(port: int) -> Iterator[BeginView]:
+    """Serve a page before and during a mission. Raises InvalidInputError for a port in use."""
+    page = open_page(port, "GaussLite map")
+    with ExitStack() as opened:
+        opened.callback(page.close)
         print_message(f"the page is at {page.url}")
-        yield view.update
-    finally:
-        view.close()
+        page.show_note(_PREPARING)
+
+        def begin(mission: ScheduledTaskMapper) -> Callable[[FrameOutcome], None]:
+            page.show_note("")
+            view = MissionView(page, mission)
+            opened.callback(view.end)
+            return view.update
+
+        yield begin
 
 
 def _view(keyframe: Keyframe) -> KeyframeView:

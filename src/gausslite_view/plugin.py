@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -11,8 +11,7 @@ import gausslite_evaluation  # noqa: F401 - all pages show its figures: without 
 from gausslite.process import import_extra
 
 if TYPE_CHECKING:
-    from gausslite.mission.schedule import ScheduledTaskMapper
-    from gausslite.mission.task_mapper import FrameOutcome
+    from gausslite.pages import BeginView
     from gausslite.wire.security import Tls
 
 
@@ -35,13 +34,11 @@ class ViserPages:
 
         return live_page(port, address, is_agent)
 
-    def mission_view(
-        self, port: int, mission: ScheduledTaskMapper
-    ) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
+    def mission_view(self, port: int) -> AbstractContextManager[BeginView]:
         """Show a mission of this process."""
         from gausslite_view.mission_view import mission_view
 
-        return mission_view(port, mission)
+        return mission_view(port)
 
     def write_report(self, path: Path, folders: Sequence[Path]) -> None:
         """Write the report."""

@@ -152,7 +152,8 @@ class PointingPanel:
 _DIALOG = """<dialog id="{uuid}" style="border:0;padding:0.7em;border-radius:0.4em">
 <p style="margin:0 0 0.6em;display:flex;gap:0.8em;align-items:center">{caption}: click the object, or drag a box around
 it <input placeholder="noun, may be empty" value="" style="flex:1"><button>Close</button></p>
-<div style="position:relative;line-height:0"><img src="data:image/jpeg;base64,{jpeg}" onload="({script})(this)" alt=""
+<div style="position:relative;line-height:0;width:fit-content;margin:auto">
+<img src="data:image/jpeg;base64,{jpeg}" onload="({script})(this)" alt=""
 style="width:min(92vw,{aspect:.4f}*84vh);cursor:crosshair;touch-action:none">
 <div style="display:none;position:absolute;border:2px solid #3ce65a;pointer-events:none"></div></div></dialog>"""
 

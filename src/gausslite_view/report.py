@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from gausslite.codec.state_file import read_png, write_atomic
+from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import StorageError
 from gausslite.domain.objects import found_text
 from gausslite_evaluation.compare import MAP_PURPOSES, team_sentence
@@ -50,6 +50,7 @@ from gausslite_view.report_pictures import (
     shared_views,
     view_sections,
 )
+from gausslite_view.view_images import read_png
 
 _GENERATOR = "gausslite report"
 # the browser itself refuses every request and every script

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import read_ply, read_world_frame
-from gausslite.codec.run_files import ViewImage, read_view_images
+from gausslite.codec.run_files import ViewImage
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark, OrientedBox
 from gausslite.mission.results import read_evaluation, read_report
@@ -23,6 +23,7 @@ from gausslite_evaluation.lpips import NAME as LPIPS_NAME
 from gausslite_view.contents import ViewContents, object_boxes, with_agents
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
+from gausslite_view.view_images import read_view_images
 
 _MAP, _PICTURES = "map.ply", "pictures"
 _FUSED_MAPS = ("concatenation", "vote", "refine")

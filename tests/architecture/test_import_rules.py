@@ -160,7 +160,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
     ("program", "unused"),
     [
         ("gausslite_parser.program", ("datasets", "mapping", "render", "perception", "calibration", "fusion", "view")),
-        ("gausslite_fusion_server.program", ("datasets", "perception", "mapping.tracking", "calibration", "view")),
+        ("gausslite_fusion_server.program", ("datasets", "perception", "calibration", "view")),
     ],
 )
 def test_a_program_imports_what_it_uses(program: str, unused: tuple[str, ...]) -> None:

@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
 NEED_AN_EXTRA = {
     "torch": ("gausslite_gpu",),
+    "mcp": ("gausslite_mcp.server",),
     "psycopg": tuple(f"gausslite_cluster.{name}" for name in ("peers", "postgres_", "region_", "shared_")),
     "rclpy": ("gausslite_ros.node",),
     "rospy": ("gausslite_ros.node_ros1",),

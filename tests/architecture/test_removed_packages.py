@@ -22,7 +22,7 @@ SEQUENCE = "../fr1_cup"
 WORKING = (
     ("gausslite", "--help"),
     ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--roi", "../regions.npz", "--out", "roi"),
-    ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--poses", "track", "--out", "uniform"),
+    ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--out", "uniform"),
     ("gausslite_fusion_server", "--store", "fusion.sqlite"),
     ("gausslite_agent",),
 )
@@ -34,12 +34,19 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
     "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
     "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
+    "gausslite_poses": (
+        ("gausslite", "map", SEQUENCE, "--out", "refused", "--poses", "track"),
+        ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "pose-prior=0.01,0.5"),
+    ),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),
     "gausslite_evaluation": (("gausslite", "eval", "map.ply", SEQUENCE),),
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
-    "gausslite_recorders": (),
+    "gausslite_recorders": (("gausslite", "map", "../frames", "--out", "refused"),),
+    "gausslite_refinement": (),
+    "gausslite_link": (("gausslite", "view", "127.0.0.1:1"),),
+    "gausslite_render": (("gausslite", "render", "map.ply", "--poses", "a", "--out", "refused"),),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),
         ("gausslite", "fuse", "a.ply", "b.ply", "--out", "fused.ply"),
@@ -47,6 +54,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
     ),
     "gausslite_demo": (("gausslite", "demo", "--out", "refused"), ("gausslite", "doctor")),
+    "gausslite_mcp": (("gausslite", "mcp", "a"),),
     "gausslite_view": (
         ("gausslite", "report", "a"),
         ("gausslite", "view", "a"),
@@ -58,7 +66,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_sim": (("gausslite", "map", "sim:home", "--out", "refused"),),
     "gausslite_bench": (("gausslite", "bench", "quality"),),
 }
-"""What each package adds to the command lines. A format of `gausslite_recorders` has no command of its own."""
+"""What each package adds to the command lines."""
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +77,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     voxels = np.stack(np.meshgrid(range(90, 120), range(-10, 10), range(20)), axis=-1).reshape(-1, 3)
     np.savez(folder / "regions.npz", voxel_size_m=0.1, cup_1=voxels.astype(np.int32))
     (folder / "detector.onnx").write_bytes(b"no model")
+    (folder / "frames").mkdir()
+    (folder / "frames" / "frame-000000.color.png").touch()
     return folder
 
 

@@ -229,7 +229,7 @@ def test_depth_images_with_swapped_bytes_are_refused(recording: Recording) -> No
 
 
 def test_poses_of_another_link_are_named(home: Source) -> None:
-    recording = Recording(home, list(range(0, 48, 2)))
+    recording = Recording(home, list(range(0, 72, 2)))
     mount = transform_of(np.array([0.1, -0.2, 0.15, 0.0, 0.25, 0.1]))
     recording.poses = np.array([T @ mount for T in recording.poses])
     with pytest.raises(

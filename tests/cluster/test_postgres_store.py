@@ -200,6 +200,15 @@ def test_damaged_rows_are_one_clear_error(postgres: PostgresServer) -> None:
     assert "of agent 'ant' is damaged" in one_line(lambda: PostgresStore(url))
 
 
+def test_a_database_without_an_encoding_keeps_names_as_text(postgres: PostgresServer) -> None:
+    url = postgres.new_database("ENCODING 'SQL_ASCII' TEMPLATE template0 LOCALE 'C'")
+    for sequence in (1, 2):
+        store = PostgresStore(url)
+        assert store.put(random_subset("ant", sequence, {11: sequence})).accepted.tolist() == [11]
+        assert store.batch("ant").counts.tolist() == [sequence]
+        store.close()
+
+
 def test_another_schema_and_missing_rights_are_one_clear_error(postgres: PostgresServer) -> None:
     url = postgres.new_database()
     PostgresStore(url).close()

@@ -10,7 +10,7 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite_detectors.model_file import open_model
-from gausslite_detectors.yolo_network import YoloNetwork, letterbox
+from gausslite_detectors.network import DetectionNetwork, letterbox
 
 torch = pytest.importorskip("torch", reason="torch, which this network is made with, is not installed")
 pytest.importorskip("onnx", reason="onnx, which torch exports with, is not installed")
@@ -41,8 +41,8 @@ def test_boxes_scores_coefficients_and_prototypes_are_torchs(tmp_path) -> None:
         warnings.simplefilter("ignore")
         blank = torch.zeros(1, 3, HEIGHT_PX, WIDTH_PX)
         torch.onnx.export(network, (blank,), str(path), opset_version=17, dynamo=False)
-    read = YoloNetwork(open_model(path, 1))
-    assert read.classes == 1
+    read = DetectionNetwork(open_model(path, 1))
+    assert read.layout.classes == 1
     rgb = np.random.default_rng(1).integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     camera = Camera(60, 60, 32, 24, WIDTH_PX, HEIGHT_PX)
     output = read.run(Frame(0, 0, rgb, np.ones((HEIGHT_PX, WIDTH_PX), np.float32), camera, np.eye(4)))
@@ -50,12 +50,12 @@ def test_boxes_scores_coefficients_and_prototypes_are_torchs(tmp_path) -> None:
         rows, prototypes = (
             each[0].numpy() for each in network(torch.from_numpy(letterbox(rgb, HEIGHT_PX, WIDTH_PX)[0]))
         )
-    np.testing.assert_allclose(output.prototypes, prototypes, atol=1e-4)
+    np.testing.assert_allclose(output.reading.masks, prototypes, atol=1e-4)
     found = output.candidates(0.001)
     corners = np.concatenate([rows[:2] - rows[2:4] / 2, rows[:2] + rows[2:4] / 2]).T
     order, expected = np.argsort(found.scores), np.argsort(rows[4])
     assert len(order) == rows.shape[1]
     np.testing.assert_allclose(found.scores[order], rows[4][expected], atol=1e-4)
-    np.testing.assert_allclose(found.coefficients[order], rows[5:].T[expected], atol=1e-4)
+    np.testing.assert_allclose(output.reading.coefficients[found.rows[order]], rows[5:].T[expected], atol=1e-4)
     limits = (WIDTH_PX, HEIGHT_PX, WIDTH_PX, HEIGHT_PX)
     np.testing.assert_allclose(found.boxes_px[order], np.clip(corners, 0, limits)[expected], atol=1e-4 * WIDTH_PX)

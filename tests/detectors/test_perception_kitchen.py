@@ -13,9 +13,9 @@ from gausslite.datasets.source import Source
 from gausslite.domain.objects import MatchBasis
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings
+from gausslite_detectors.class_detector import ClassDetector, load_class_detector
 from gausslite_detectors.class_match import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite_detectors.model_file import open_model
-from gausslite_detectors.yolo import YoloDetector, load_yolo
 from gausslite_language.rules import RuleParser
 
 pytestmark = pytest.mark.slow
@@ -27,11 +27,11 @@ def kitchen(shared_dir: Path) -> Source:
 
 
 @pytest.fixture(scope="module")
-def detector(shared_dir: Path) -> YoloDetector:
-    return load_yolo(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
+def detector(shared_dir: Path) -> ClassDetector:
+    return load_class_detector(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
 
 
-def estimator_for(text: str, kitchen: Source, detector: YoloDetector) -> TaskRelevanceEstimator:
+def estimator_for(text: str, kitchen: Source, detector: ClassDetector) -> TaskRelevanceEstimator:
     settings = RelevanceTrackerSettings(up_axis=kitchen.up_axis, max_frames=1)
     return TaskRelevanceEstimator(RuleParser().parse(text), detector, settings)
 

@@ -16,8 +16,9 @@ from gausslite.domain.objects import MatchBasis
 from gausslite.perception.detector import Detector
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
+from gausslite_detectors.layouts import ModelFamily
 from gausslite_detectors.model_file import open_model
-from gausslite_detectors.models import READER, ModelFamily, identify_family
+from gausslite_detectors.models import READER, identify_family
 from gausslite_detectors.open_vocabulary import PromptedYolo
 from gausslite_detectors.text_features import ClipTextEncoder, NounVectorTable
 
@@ -121,7 +122,7 @@ def test_a_table_of_text_vectors_replaces_the_encoder(tmp_path):
     assert found[0].mask.sum() == 24 * 24
     tankard, umbrella = detector.matches(["beer tankard", "umbrella"])
     assert (tankard.classes, tankard.is_searched) == (("tankard",), True)
-    assert umbrella.warning == "no class of the detector matches 'umbrella'"
+    assert umbrella.warning == "no class of the detector matches 'umbrella'; point at it, or prompt a detector by text"
 
 
 def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):

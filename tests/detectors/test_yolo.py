@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,25 +13,29 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
+from gausslite.perception.detector_file import DetectorOptions
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 from gausslite_detectors.boxes import BoxSizeLimits
-from gausslite_detectors.model_file import open_model
-from gausslite_detectors.yolo import (
+from gausslite_detectors.class_detector import (
     ClassAgnosticSegmenter,
     ClassAgnosticSettings,
-    YoloDetector,
-    YoloSettings,
-    load_yolo,
+    ClassDetector,
+    ClassDetectorSettings,
+    load_class_detector,
 )
-from gausslite_detectors.yolo_network import YoloNetwork
+from gausslite_detectors.model_file import open_model
+from gausslite_detectors.models import READER
+from gausslite_detectors.network import DetectionNetwork
+from gausslite_detectors.tiles import TiledDetector, Tiling
 
 NAMES = ("cup", "chair", "dining table")
 
 
-def detector_from(path: Path) -> YoloDetector:
-    return load_yolo(open_model(path, threads=1))
+def detector_from(path: Path) -> ClassDetector:
+    return load_class_detector(open_model(path, threads=1))
 
 
 def frame_with_red_square() -> Frame:
@@ -42,6 +47,11 @@ def frame_with_red_square() -> Frame:
 
 # the square in the network's pixels: columns 16 to 32, rows 24 to 40
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
+
+
+def mapped(detections: Sequence[Detection]) -> list[Detection]:
+    """Return the detections with a mask; the others are only reported."""
+    return [detection for detection in detections if detection.mask.any()]
 
 
 def test_boxes_and_masks_are_mapped_back_to_the_image(tmp_path):
@@ -78,7 +88,7 @@ def test_a_frame_that_was_made_smaller_is_searched_as_recorded(tmp_path):
     expected = np.zeros((32, 64), np.bool_)
     expected[8:24, 16:32] = True
     assert (found.mask & expected).sum() / (found.mask | expected).sum() > 0.9
-    assert detector.detect(replace(small, recorded_rgb=None), ["mug"]) == []
+    assert mapped(detector.detect(replace(small, recorded_rgb=None), ["mug"])) == []
 
 
 def test_a_mask_stays_in_its_box(tmp_path):
@@ -100,7 +110,8 @@ def test_suppression_is_per_class(tmp_path):
 def test_boxes_below_the_score_or_without_a_mask_are_dropped(tmp_path):
     doubtful, black = (24.0, 32.0, 16.0, 16.0, 0, 0.08), (52.0, 32.0, 16.0, 16.0, 0, 0.9)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [doubtful, black]))
-    assert detector.detect(frame_with_red_square(), ["cup"]) == []
+    (unmapped,) = detector.detect(frame_with_red_square(), ["cup"])
+    assert (unmapped.mask.any(), unmapped.is_weak, unmapped.score) == (False, True, pytest.approx(0.9))
 
 
 def test_boxes_below_the_threshold_are_weak_and_of_named_objects_only(tmp_path):
@@ -120,8 +131,8 @@ def test_boxes_too_large_for_their_class_are_dropped_whatever_else_is_asked_for(
     # the box is 0.38 m wide at a depth of 0.3 m, and 0.77 m wide at 0.6 m
     for queries in (["cup"], ["cup", "chair", "table"]):
         assert len(detector_from(path).detect(near, queries)) == 1
-        assert detector_from(path).detect(far, queries) == []
-    lenient = YoloDetector(open_model(path), None, YoloSettings(box_limits=BoxSizeLimits(scale=2.0)))
+        assert mapped(detector_from(path).detect(far, queries)) == []
+    lenient = ClassDetector(open_model(path), None, ClassDetectorSettings(box_limits=BoxSizeLimits(scale=2.0)))
     assert len(lenient.detect(far, ["cup"])) == 1
 
 
@@ -136,7 +147,8 @@ def test_a_noun_without_a_class_is_unsupported(tmp_path):
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
     cup, umbrella = detector.matches(["cup", "umbrella"])
     assert (cup.classes, cup.is_searched, cup.warning) == (("cup",), True, None)
-    assert (umbrella.is_searched, umbrella.warning) == (False, "no class of the detector matches 'umbrella'")
+    expected = "no class of the detector matches 'umbrella'; point at it, or prompt a detector by text"
+    assert (umbrella.is_searched, umbrella.warning) == (False, expected)
 
 
 def test_a_different_class_in_the_same_box_is_the_rival(tmp_path):
@@ -167,6 +179,42 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     restored = TaskRelevanceEstimator(task, detector)
     restored.restore(strict.state())
     assert restored.nouns == strict.nouns
+
+
+@pytest.mark.parametrize(
+    ("score", "expected"),
+    [
+        (0.1, "seen in frame 3 with 0.10 (threshold 0.25): --set min-score=0.08, or point at it"),
+        (0.01, "not seen so far; point at it if a frame shows it"),
+        (
+            0.9,
+            "seen in frame 3 with 0.90, but too large, without depth, or enlarged only: a lower min-score may do, "
+            "or point at it",
+        ),
+    ],
+)
+def test_a_noun_that_is_not_found_says_what_was_seen(tmp_path, score, expected):
+    box = (32.0, 32.0, 64.0, 24.0, 1, score) if score > 0.5 else (24.0, 32.0, 16.0, 16.0, 1, score)
+    for index, path in enumerate((tmp_path / "masks.onnx", tmp_path / "boxes.onnx")):
+        (write_boxes_only if index else write_tiny_yolo)(path, ("tv", "book"), [box])
+        detector = TiledDetector(READER.open(path, DetectorOptions(threads=1)), Tiling(2))
+        estimator = TaskRelevanceEstimator(TaskGraph("id", "find the book", ("book",), (), ()), detector)
+        assert not estimator.estimate(replace(frame_with_red_square(), index=3)).relevance.roi.any()
+        (report,) = estimator.nouns
+        assert report.describe().endswith(expected)
+        assert (report.detections, report.objects) == (0, 0)
+        restored = TaskRelevanceEstimator(TaskGraph("id", "find the book", ("book",), (), ()), detector)
+        restored.restore(estimator.state())
+        assert restored.nouns == estimator.nouns
+
+
+def test_one_threshold_holds_for_detections_and_weak_ones(tmp_path):
+    path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [(24.0, 32.0, 16.0, 16.0, 1, 0.09)])
+    for least, is_weak in ((0.08, False), (0.2, True)):
+        detector = READER.open(path, DetectorOptions(threads=1, min_score=least))
+        (found,) = detector.detect(frame_with_red_square(), ["chair"])
+        assert (found.is_weak, found.mask.any()) == (is_weak, True)
+        assert [match.min_score for match in detector.matches(["chair"])] == [least]
 
 
 @pytest.mark.parametrize(("score", "marked"), [(0.3, {True, False}), (0.5, {True})])
@@ -221,7 +269,10 @@ def test_boxes_without_masks_are_those_of_the_network_with_masks(tmp_path):
 
 
 def test_a_model_with_other_rows_than_its_class_names_is_refused(tmp_path):
-    _refused(write_boxes_only(tmp_path / "boxes.onnx", NAMES, [CUP], more_rows=1), r"or \[1, 7, A\], got \[1, 8, 1\]")
+    _refused(
+        write_boxes_only(tmp_path / "boxes.onnx", NAMES, [CUP], more_rows=1),
+        r"got boxes with objectness, .*\[1, 8, 1\]",
+    )
 
 
 def test_a_model_without_class_names_is_refused(tmp_path):
@@ -232,7 +283,7 @@ def test_a_model_without_class_names_is_refused(tmp_path):
 
 def test_settings_are_checked():
     with pytest.raises(InvalidInputError, match="detector min_score: expected between 0 and 1"):
-        YoloSettings(min_score=1.5)
+        ClassDetectorSettings(min_score=1.5)
     with pytest.raises(InvalidInputError, match="box limit scale: expected a positive number"):
         BoxSizeLimits(scale=0.0)
     with pytest.raises(InvalidInputError, match="box limit min_known_share: expected 0 to 1"):
@@ -253,7 +304,7 @@ BOX = (32.0, 16.0, 64.0, 48.0)
 
 def segmenter(tmp_path, *boxes, names=("object",)):
     return ClassAgnosticSegmenter(
-        YoloNetwork(open_model(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
+        DetectionNetwork(open_model(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
     )
 
 

@@ -65,6 +65,9 @@ def test_eval_scores_the_frames_that_were_held_out(
     assert main(["eval", str(map_path.parent), str(kitchen), "--set", "threads=1", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["n_views"] == 2
+    other_spelling = str(tmp_path / "out" / ".." / kitchen.name)
+    assert main(["eval", str(map_path), other_spelling, "--set", "threads=1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["n_views"] == 2
     assert "from the report next to map.ply: --test-every 5\n" in captured.err
     assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", "--test-every", "1"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 10

@@ -215,7 +215,7 @@ def test_a_map_that_is_too_faint_to_occupy_a_voxel_is_refused(tmp_path, name):
 def test_a_map_beyond_the_grid_is_refused_before_memory_is_taken(tmp_path, name, message):
     room = plate(0.5)
     means_m = room.means_m.copy()
-    means_m[[0, 1], [0, 1]] = 5000
+    means_m[::2, :2] += 5000
     with pytest.raises(InvalidInputError, match=message):
         export(tmp_path, name, dataclasses.replace(room, means_m=means_m))
 
@@ -260,6 +260,19 @@ def test_nav2_grid_has_obstacles_floor_and_unknown_cells(tmp_path):
     assert cell(0.2, -0.2) == 0
     assert cell(0.8, -0.8) == 254  # the floor
     assert set(np.unique(image)) <= {0, 205, 254}
+    # as map servers load it, whether they compare with a threshold itself or beyond it
+    share = {grey: (255 - grey) / 255 for grey in (0, 205, 254)}
+    assert share[254] < described["free_thresh"] < share[205] < described["occupied_thresh"] < share[0]
+
+
+@pytest.mark.parametrize("name", ["nav2", "octomap"])
+@pytest.mark.parametrize("fault", ["far", "large"])
+def test_an_outlier_does_not_decide_the_size_of_a_grid(tmp_path, capsys, name, fault):
+    room = plate(0.0, size_m=2.0)
+    size_bytes = export(tmp_path, name, room).stat().st_size
+    (room.means_m if fault == "far" else room.scales_m)[0] = 9e3
+    assert export(tmp_path, name, room).stat().st_size == pytest.approx(size_bytes, rel=0.2)
+    assert "left out 1 Gaussians that lie or reach farther than" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.0, 0.6, -0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])

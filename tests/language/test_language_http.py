@@ -11,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from gausslite.domain.errors import LanguageModelError
+from gausslite.domain.task import TargetRole
 from gausslite_language.backends import HttpBackend, ModelSettings
 from gausslite_language.models.http import HttpLanguageModel, HttpSettings, ResponseFormat
 from gausslite_language.models.parsers import ANSWER_SCHEMA, messages_for
@@ -162,3 +163,35 @@ def test_answers_are_cached_and_failures_are_warnings() -> None:
         assert len(requests) == 1
         assert parser.parse("Find the vase").warnings[0].startswith("backend http failed")
     assert parser.parse("Find the lamp").warnings[0].startswith("backend http failed (language model: the call failed")
+
+
+@pytest.mark.parametrize(
+    ("task", "added", "warnings"),
+    [
+        (
+            "There is a red victim behind me. Go to the door.",
+            ("victim",),
+            ("'victim' was added by the language model",),
+        ),
+        ("There is a herd behind me. Go to the door.", (), ("'herd' is not part of the task",)),
+        ("Go to the door.", (), ()),
+    ],
+)
+def test_mode_add_asks_only_for_nouns_that_the_rules_lost(task, added, warnings):
+    answer = json.dumps({"targets": ["red victim", "dragon", "door"], "anchors": [], "relations": []})
+    with server(send_response(completion(answer))) as (url, requests):
+        graph = HttpBackend(ModelSettings(model="phi", url=url, mode="add")).open().parse(task)
+    assert graph.targets == ("door", *added)
+    assert graph.roles[0] is TargetRole.DESTINATION  # that of the rules
+    assert [(each.name, each.colour) for each in graph.attributes] == [(name, "red") for name in added]
+    assert graph.warnings == warnings
+    assert len(requests) == len(warnings)
+
+
+def test_mode_add_keeps_the_graph_of_the_rules_if_the_model_fails():
+    task = "There is a victim behind me. Go to the door."
+    with server(send_response(b"", 500)) as (url, _):
+        graph = HttpBackend(ModelSettings(model="phi", url=url, mode="add")).open().parse(task)
+    assert graph.targets == ("door",)
+    assert graph.warnings[0].startswith("backend http failed")
+    assert graph.warnings[1:] == ("'victim' is not part of the task",)

@@ -339,6 +339,36 @@ def test_what_is_not_understood_is_a_warning(text, word):
     assert all(word not in name for name in (*graph.queries, *graph.excluded))
 
 
+@pytest.mark.parametrize(
+    ("text", "same", "warning"),
+    [
+        ("grab teh mgu frm the tabel", "Grab the mug from the table", "'mgu' is read as 'mug'"),
+        ("pls find teh vaze b4 the windw", "Find the vase before the window", "'vaze' is read as 'vase'"),
+        ("clean dsk w/ the spnge", "Clean desk with the sponge", "'dsk' is read as 'desk'"),
+        ("Meet Jahne at the door", "Meet Jahne at the door", "'jahne' is no known noun: it may be misread"),
+    ],
+)
+def test_what_is_typed_in_a_hurry_is_read_with_a_warning(text, same, warning):
+    graph = RuleParser().parse(text)
+    assert graph.is_equivalent_to(RuleParser().parse(same))
+    assert warning in graph.warnings
+    assert (graph.text, graph.task_id) == (text, task_id_of(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "lost"),
+    [
+        ("There is a victim behind the wall. Go to the door.", ["victim", "wall"]),
+        ("Bring me a bottle of water and a bar of soap", []),
+        ("I am hungry, get me the apple", []),
+        ("The baby sleeps, so close the curtains because guests are coming", []),
+    ],
+)
+def test_a_noun_that_the_graph_lacks_is_named_in_a_warning(text, lost):
+    named = [warning for warning in RuleParser().parse(text).warnings if "is not part of the task" in warning]
+    assert named == [f"{noun!r} is not part of the task" for noun in lost]
+
+
 def test_spellings_of_one_task_have_one_id():
     assert task_id_of("Pick up  the Mug.") == task_id_of("pick up the mug")
     assert task_id_of("pick up the mug") != task_id_of("pick up the cup")

@@ -66,6 +66,7 @@ def test_an_agent_continues_a_map_from_any_start_and_after_a_restart(earlier: Pa
     with _worker(prior) as worker:
         report = worker.submit(first).result()
         assert (report.outcome, report.reason, report.gaussians) == (Outcome.SKIPPED, LOCALISING, 0)
+        assert worker.status().notes == (LOCALISING,)
         assert worker.submit(second).result().gaussians >= len(prior.saved.gaussians)
         worker.submit(third).result()
         correction = worker.status().correction

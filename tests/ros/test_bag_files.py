@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,15 @@ def test_messages_count_and_not_the_profile(tmp_path: Path, name: str, profile: 
     channels, messages = mcap_parts(write_small_bag(tmp_path / name))
     (tmp_path / "b.mcap").write_bytes(mcap(profile, [*channels, *(data for _, data in messages)]))
     require_small_bag(frames_of(tmp_path / "b.mcap"))
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run.bag", "run"])
+def test_frames_are_read_from_several_threads(tmp_path: Path, name: str) -> None:
+    source = open_source(str(write_small_bag(tmp_path / name)))
+    with ThreadPoolExecutor(8) as pool:
+        frames = list(pool.map(lambda i: source.frame(i % FRAMES), range(20 * FRAMES)))
+    for start in range(0, len(frames), FRAMES):
+        require_small_bag(frames[start : start + FRAMES])
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite.wire.map_follower import FollowedMap
 from gausslite_export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancySettings
+from gausslite_link.map_follower import FollowedMap
 from gausslite_ros.live_map import Grid, LiveMap
 
 CELL_M = 0.1

@@ -10,7 +10,7 @@ import pytest
 from sample_gaussians import plain_gaussians
 from test_robot_session import MUG, NOW_NS, PUBLICATIONS, SNAPSHOT
 
-from gausslite.wire.robot import SentFrames
+from gausslite_link.agent_link import SentFrames
 from gausslite_ros.live_frames import LiveCounters
 from gausslite_ros.live_map import Grid
 from gausslite_ros.messages import CompressedImageMessage, stamp_ns

@@ -19,7 +19,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.wire.clients import AgentClient
-from gausslite.wire.robot import AgentLink, AgentSnapshot, SentFrames
+from gausslite_link.agent_link import AgentLink, AgentSnapshot, SentFrames
 from gausslite_ros.bag_file import BagAddress
 from gausslite_ros.bag_source import BagSource
 from gausslite_ros.live_frames import LiveCounters

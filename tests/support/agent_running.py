@@ -23,7 +23,7 @@ from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import ChangeNotifier
-from gausslite_agent.keyframe_upload import KeyframeUpload
+from gausslite_agent.keyframe_upload import open_upload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.servicer import AgentServicer
@@ -81,7 +81,7 @@ def agent(
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []
     on_change = lambda: loops[0].call_soon_threadsafe(lambda: notifiers[0].notify())  # noqa: E731
-    keyframes = None if uplink is None else KeyframeUpload(uplink, GRID, 64, during_mission=False)
+    keyframes = None if uplink is None else open_upload(uplink, GRID, 64, during_mission=False)
     worker = MappingWorker(
         SETTINGS,
         GRID,

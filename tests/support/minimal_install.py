@@ -93,6 +93,7 @@ def missing_extras(out: Path) -> list[dict[str, object]]:
         ("view", "gausslite_agent", ("--listen", "127.0.0.1:50099", "--set", "view=0")),
         ("view", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--view", "0")),
         ("metrics", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--metrics", "127.0.0.1:0")),
+        ("mcp", "gausslite", ("mcp", run_folder)),
         *(("export", "gausslite", ("export", run_folder, "--to", kind)) for kind in ("spz", "las", "octomap", "mesh")),
         ("cuda", "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / "cuda"), "--set", "rasterizer=cuda")),
     ]

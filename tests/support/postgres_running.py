@@ -36,13 +36,13 @@ class PostgresServer:
         self._numbers = itertools.count()
         self._socket_folder = server.get_postmaster_info().socket_dir
 
-    def new_database(self) -> str:
+    def new_database(self, options: str = "") -> str:
         """Return the address of a new, empty database, with a password that the server does not ask for."""
         import psycopg
 
         name = f"store{next(self._numbers)}"
         with psycopg.connect(self._server.get_uri(), autocommit=True) as db:
-            db.execute(f"CREATE DATABASE {name}")
+            db.execute(f"CREATE DATABASE {name} {options}")
         return f"postgresql://postgres:{PASSWORD}@/{name}?host={self._socket_folder}"
 
     def kill(self) -> None:

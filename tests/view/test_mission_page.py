@@ -6,14 +6,16 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import pytest
 from browser import open_browser, point
 from mapping_scenes import wall_frame
-from page_controls import control
+from page_controls import control, text
 from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
@@ -28,7 +30,7 @@ from gausslite_language.rules import RuleParser
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 pytest.importorskip("viser")
-from gausslite_view.mission_view import MissionRequests, MissionView
+from gausslite_view.mission_view import MissionRequests, MissionView, mission_view
 from gausslite_view.pages import open_page
 
 WAIT_S = 60.0
@@ -109,7 +111,8 @@ def test_a_click_on_the_camera_image_is_a_target_until_it_is_left_out() -> None:
             assert searched.process(wall_frame(len(shares))).roi_share == 0
             assert searched.graph.targets == ("lamp",)
         finally:
-            view.close()
+            view.end()
+            page.close()
 
 
 def test_the_page_is_answered_between_frames_and_refused_after_the_mission() -> None:
@@ -202,3 +205,25 @@ def test_a_resumed_run_keeps_what_a_person_has_pointed_at(tmp_path: Path) -> Non
     options[1] = str(tmp_path / "later" / "kitchen")
     assert main([*options, "--set", f"resume={state}"]) == 3
     assert json.loads((out / "report.json").read_text())["targets"] == ["mug", "wall"]
+
+
+def test_the_page_is_there_before_the_mission_and_refuses_after_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with mission_view(0) as begin:
+        url = capsys.readouterr().err.split()[-1]
+        with urlopen(url) as answer:
+            assert answer.status == 200
+        begin(mission())
+    with pytest.raises(URLError):
+        urlopen(url)
+
+
+def test_the_current_task_stands_on_the_page_also_while_the_field_has_another() -> None:
+    searched = mission()
+    with closing(open_page(0, "test")) as page:
+        view = MissionView(page, searched)
+        control(page, "Task").value = "Find the qqq"
+        assert "task: Find the mug" in text(page)
+        searched.assign(RuleParser().parse("Find the lamp"))
+        view.update(searched.process(wall_frame()))
+        assert "task: Find the lamp" in text(page)
+        view.end()

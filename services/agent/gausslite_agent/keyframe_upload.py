@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.frame import FrameId
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.keyframe_selection import Coverage, KeyframeAddition, KeyframeSelection, SelectedKeyframe
+from gausslite.mapping.keyframe_selection import KeyframeAddition, KeyframeSelection, OpenSelection, SelectedKeyframe
 from gausslite.mapping.keyframes import Keyframe
+from gausslite.plugins import Group, find
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.convert import KEYFRAME_PNG_COMPRESSION, encode_mask, frame_to_message, transform_from_message
 from gausslite.wire.spool import SpooledKeyframe
@@ -21,10 +22,9 @@ _log = logging.getLogger(__name__)
 class KeyframeUpload:
     """Selects keyframes and passes them to the uplink. Not thread-safe."""
 
-    def __init__(self, uplink: Uplink, grid: VoxelGrid, max_keyframes: int, during_mission: bool) -> None:
-        """max_keyframes: the most that the server has at a time. during_mission: also send while mapping."""
-        self._uplink, self._during_mission = uplink, during_mission
-        self._selection = KeyframeSelection(max_keyframes, grid, _selected_keyframes(uplink))
+    def __init__(self, uplink: Uplink, selection: KeyframeSelection, during_mission: bool) -> None:
+        """during_mission: also send while mapping."""
+        self._uplink, self._selection, self._during_mission = uplink, selection, during_mission
         self._last_considered: FrameId | None = None
 
     def enqueue_newest(self, keyframes: Sequence[Keyframe]) -> None:
@@ -46,12 +46,21 @@ class KeyframeUpload:
         message = frame_to_message(frame, compact=True)
         message.region_png = encode_mask(addition.keyframe.relevance.roi, KEYFRAME_PNG_COMPRESSION)
         data = message.SerializeToString()
-        spooled = SpooledKeyframe(frame.index, addition.gain, addition.coverage.to_bytes(), data)
+        spooled = SpooledKeyframe(frame.index, addition.gain, addition.coverage, data)
         try:
             self._uplink.enqueue_keyframe(spooled, addition.replaced)
         except StorageError as error:
             # mapping does not depend on it
             _log.warning("keyframe %d is not sent: %s", frame.index, error)
+
+
+def open_upload(uplink: Uplink, grid: VoxelGrid, max_keyframes: int, during_mission: bool) -> KeyframeUpload | None:
+    """Return the upload of at most so many keyframes; None without a plug-in that selects them."""
+    create: OpenSelection | None = find(Group.KEYFRAME_SELECTIONS)
+    if create is None:
+        _log.warning("no keyframes are sent: no plug-in of %s is installed", Group.KEYFRAME_SELECTIONS)
+        return None
+    return KeyframeUpload(uplink, create(max_keyframes, grid, _selected_keyframes(uplink)), during_mission)
 
 
 def _selected_keyframes(uplink: Uplink) -> dict[int, SelectedKeyframe]:
@@ -63,7 +72,5 @@ def _selected_keyframes(uplink: Uplink) -> dict[int, SelectedKeyframe]:
             T_world_camera = transform_from_message("keyframe t_world_camera", message.t_world_camera)
         except InvalidInputError as error:
             raise StorageError(f"spool: keyframe {selected_keyframe.frame_index} is damaged: {error}") from error
-        known[selected_keyframe.frame_index] = SelectedKeyframe(
-            Coverage.from_bytes(selected_keyframe.coverage), T_world_camera
-        )
+        known[selected_keyframe.frame_index] = SelectedKeyframe(selected_keyframe.coverage, T_world_camera)
     return known

@@ -279,8 +279,8 @@ class MappingWorker:
                 self._sent_voxels if self.uplink is not None else None,
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
-                build_tracker(self._settings, self._mapper),
-                monitor=open_monitor(self._settings, self.prior),
+                tracker=build_tracker(self._settings, self._mapper),
+                monitor=open_monitor(self._settings, self.prior, in_background=True),
             )
         elif current is None or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign
@@ -322,6 +322,7 @@ class MappingWorker:
         frame = self._place(queued.frame)
         if frame is None:
             self._status.update(localisation=LocalisationState.LOST)
+            self._update_notes((LOCALISING,))
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index

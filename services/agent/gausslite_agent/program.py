@@ -32,7 +32,7 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import ChangeNotifier
-from gausslite_agent.keyframe_upload import KeyframeUpload
+from gausslite_agent.keyframe_upload import KeyframeUpload, open_upload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import NO_DETECTOR, AgentMission
 from gausslite_agent.servicer import AgentServicer
@@ -272,7 +272,7 @@ def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: Exit
 def _keyframe_upload(link: ConnectionSettings, uplink: Uplink | None) -> KeyframeUpload | None:
     if uplink is None or link.keyframes == 0:
         return None
-    return KeyframeUpload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)
+    return open_upload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)
 
 
 def _scene(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap | None) -> SceneInfo:

@@ -253,10 +253,10 @@ class WorkerStatus:
 
     @property
     def task_notes(self) -> tuple[str, ...]:
-        """One line if no frame has shown the task's region."""
-        if self.mapped == 0 or self.graph is None or self.roi_share_sum > 0:
-            return ()
-        return (f"the task's targets were not found in {self.mapped} frames: {', '.join(self.graph.targets)}",)
+        """What of the task is not understood, and one line for each target if no frame has shown the task's region."""
+        unread = () if self.graph is None else (line for line in self.graph.warnings if line not in self.notes)
+        targets = () if self.graph is None or self.mapped == 0 or self.roi_share_sum > 0 else self.graph.targets
+        return (*unread, *(f"target {target!r} was not found in {self.mapped} frames" for target in targets))
 
     @property
     def load_notes(self) -> tuple[str, ...]:

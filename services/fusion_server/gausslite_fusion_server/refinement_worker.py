@@ -12,7 +12,9 @@ from threading import Event
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.fusion.refinement import CreateRasterizer, Refinement, RefineProgress, RefineSettings
+from gausslite.fusion.map_renderer import CreateRasterizer
+from gausslite.fusion.refinement import OpenRefinement, RefineProgress, RefineSettings
+from gausslite.plugins import Group, load
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.views import ChangeNotifier
 
@@ -32,9 +34,10 @@ class RefinementWorker:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
 
         A slow reader misses some progress, but never the last one. Raises QuotaError if another refinement runs, and
-        those of Refinement.
+        those of OpenRefinement; MissingPluginError.
         """
         settings = self._settings_for(request)
+        open_refinement: OpenRefinement = load(Group.REFINERS, purpose="refinement")
         if self._busy:
             raise QuotaError("refinement: expected one at a time, got a second while one is running")
         self._busy = True
@@ -47,7 +50,7 @@ class RefinementWorker:
 
         def work() -> None:
             vote = engine.refinement_input()
-            refinement = Refinement(vote, self.create_rasterizer(), settings)
+            refinement = open_refinement(vote, self.create_rasterizer(), settings)
             for line in refinement.left_out:
                 _log.warning("refinement: left out, because they disagree with the vote: %s", line)
             for progress in refinement.steps():

@@ -16,7 +16,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaErro
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.limits import MissionConfig, SessionRecord
-from gausslite.fusion.refinement import MapRenderer
+from gausslite.fusion.map_renderer import MapRenderer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire import convert

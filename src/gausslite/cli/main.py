@@ -23,19 +23,6 @@ _CORE: Final = {
 }
 
 
-class _PrintVersion(argparse.Action):
-    """Print the version of the installed distribution, which is looked up only on request."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import PackageNotFoundError, version
-
-        try:
-            print(f"gausslite {version('gausslite')}")
-        except PackageNotFoundError:
-            print("gausslite from a source tree that is not installed")
-        parser.exit()
-
-
 def commands() -> dict[str, Command]:
     """Return the sub-commands: those of the core, then those of the packages beside it."""
     return _CORE | {name: _plugin(name) for name in names(Group.COMMANDS) if name not in _CORE}
@@ -54,7 +41,6 @@ def _plugin(name: str) -> Command:
 def build_parser(configured: Collection[str] | None = None) -> CommandParser:
     """Return the parser of `gausslite`. configured: commands that get their options, which imports their modules."""
     parser = CommandParser(prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task.")
-    parser.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, command in commands().items():
         summary = command.summary

@@ -22,7 +22,7 @@ from gausslite.datasets.open import default_world_frame, open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
-from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
+from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR, TOO_FAR
 from gausslite.domain.objects import found_text
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.task import TaskGraph
@@ -44,7 +44,7 @@ from gausslite.mission.results import (
     write_results,
 )
 from gausslite.mission.runner import MissionResult
-from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, TaskSchedule, Timeline
+from gausslite.mission.schedule import MapRecorder, TaskSchedule, Timeline
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
@@ -54,7 +54,7 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome
-from gausslite.pages import load_pages
+from gausslite.pages import BeginView, load_pages
 from gausslite.plugins import Group, load
 from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, DeferredInterrupt
 from gausslite.render.map_viewer import view_map
@@ -93,6 +93,7 @@ def tracking_text(report: Mapping[str, Any]) -> str:
 _SKIPS = {
     NO_DEPTH: "without depth",
     ONE_COLOUR: "of one colour",
+    TOO_FAR: "too far",
     REPEATED: "repeated",
     TRACKING_LOST: "lost by tracking",
     UNPLACED: "without a known place",
@@ -110,9 +111,6 @@ class MapOptions:
     )
     overwrite: bool = option(False, "replace a map in --out (resume does so without this option)")
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
-    force: bool = option(
-        False, "map although poses or depth contradict the images (default: end with what would agree)"
-    )
     task_at: tuple[str, ...] = option(
         (), "switch to another task at this frame number", metavar="FRAME:TASK", repeats=True
     )
@@ -217,14 +215,15 @@ def run(options: argparse.Namespace) -> int:
     with locked_folder(options.out):
         if options.save_state is not None:
             require_additional_file(options.save_state, options.out)
-        return _map(options, plan.open())
+        with _page(options.view) as begin_view:
+            return _map(options, run := plan.open(), begin_view(run.scheduled))
 
 
-def _map(options: argparse.Namespace, run: OpenRun) -> int:
+def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None]) -> int:
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
         timeline, recorder = Timeline(), MapRecorder()
-        mapped = _map_frames(options, run, timeline, recorder)
+        mapped = _map_frames(options, run, draw, timeline, recorder)
         written = _write_results(options, mapped, timeline, recorder) if mapped.is_worth_keeping else None
     # an early end keeps the map so far; the exit code reports it
     if isinstance(mapped.result.stopped_by, KeyboardInterrupt):
@@ -241,10 +240,16 @@ def _map(options: argparse.Namespace, run: OpenRun) -> int:
     return 0 if mapped.has_found_task else TASK_NOT_FOUND
 
 
-def _map_frames(options: argparse.Namespace, run: OpenRun, timeline: Timeline, recorder: MapRecorder) -> MappedRun:
+def _map_frames(
+    options: argparse.Namespace,
+    run: OpenRun,
+    draw: Callable[[FrameOutcome], None],
+    timeline: Timeline,
+    recorder: MapRecorder,
+) -> MappedRun:
     """Map all frames with a bar. Raises DatasetError if frames exist and none of them can be used."""
     mapper = run.scheduled.mapper
-    with _view(options.view, run.scheduled) as draw, MappingBar(len(run.stream)) as bar:
+    with MappingBar(len(run.stream)) as bar:
 
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
@@ -311,7 +316,7 @@ def _notes(options: argparse.Namespace, mapped: MappedRun) -> Iterator[str]:
     yield from mapped.mapper.notes
     if result.processed > 0 and not result.totals.region_seen:
         if options.task is not None:
-            yield "none of these frames shows an object of the task"
+            yield "found nothing of the task in these frames"
         elif has_regions(options):
             yield "none of these frames shows the selected region; check that it belongs to this sequence, in metres"
     for frame, _ in mapped.run.scheduled.schedule.switches:
@@ -362,11 +367,11 @@ def _outcome(mapped: MappedRun, scores: TrainingFit | None) -> str:
     return "; ".join(parts)
 
 
-def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
-    """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
+def _page(port: int | None) -> AbstractContextManager[BeginView]:
+    """Return the page of a run; no page without a port."""
     if port is None:
-        return nullcontext(lambda _outcome: None)
-    return load_pages("--view").mission_view(port, mission)
+        return nullcontext(lambda _mission: lambda _outcome: None)
+    return load_pages("--view").mission_view(port)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult, written: _Written | None) -> str:
@@ -398,7 +403,8 @@ def require_mappable_depth(mapped: MappedRun) -> None:
     spec, source, result = mapped.run.plan.source.spec, mapped.run.stream.source, mapped.result
     if result.totals.frames == 0:
         reasons = ", ".join(f"in {count} {reason}" for reason, count in result.totals.reasons.items())
-        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}")
+        advice = f"; {_depth_unit_advice(source)}" if TOO_FAR in result.totals.reasons else ""
+        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}{advice}")
     if result.stopped_by is None:
         raise DatasetError(
             f"{spec}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "

@@ -127,6 +127,7 @@ def noun_as_json(report: NounReport) -> dict[str, Any]:
         "searched": match.is_searched,
         "detections": report.detections,
         "best_score": report.best_score,
+        "best_frame": report.best_frame,
         "confirmed_objects": report.objects,
         "rival": report.rival,
     }

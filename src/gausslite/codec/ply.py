@@ -3,7 +3,8 @@
 Columns: x y z | f_dc_0..2 = (rgb - 0.5) / C0 | opacity as logit | scale_0..2 as log | rot_0..3 = w x y z | additional:
 active, kappa, target. All columns are float, because common readers read a row as a run of floats; so kappa is exact
 up to 2^24. The reader takes all formats of PLY and finds columns by name, in any order and type. It ignores other
-tools' columns (normals, f_rest) and elements; the additional ones may be missing (then inactive, kappa 0, no target).
+tools' columns (normals) and elements; the additional ones may be missing (then inactive, kappa 0, no target).
+f_rest_0 to f_rest_{3k-1}: coefficients of the k spherical harmonics of degree 1 to 3, first all of red (`StoredMap`).
 An opacity of ±infinity is 1 or 0, a scale of -infinity is flat. The header may name the map's world frame:
 `comment world_frame NAME`, in ASCII, other characters percent-encoded.
 """
@@ -21,15 +22,18 @@ from urllib.parse import quote, unquote
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import DTypeLike, NDArray
 
 from gausslite.codec.state_file import write_atomic
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.file_formats import FOREIGN_BYTES, foreign_format
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
 
 SH_C0 = 0.28209479177387814
+HARMONICS = "colours that depend on the view (spherical harmonics above degree 0)"
 _MAX_GAUSSIANS = 100_000_000
 _MAX_HEADER_BYTES = 1 << 16
 _WORLD_FRAME_COMMENT = "comment world_frame "
@@ -39,7 +43,9 @@ _POSITIONS, _COLOURS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES, _ROTATIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 _STANDARD = (*_POSITIONS, *_COLOURS, "opacity", *_SCALES, *_ROTATIONS)
 _EXTRAS = ("active", "kappa", "target")
-_ROW = np.dtype([(name, "<f4") for name in (*_STANDARD, *_EXTRAS)])
+_REST = "f_rest_"
+_REST_COUNTS = (9, 24, 45)
+"""Of the columns of degree 1, 2 and 3."""
 _PLY_TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
     **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
@@ -52,30 +58,38 @@ _PRINTABLE = "".join(chr(code) for code in range(0x20, 0x7F) if chr(code) != "%"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
-    """The content of a PLY file. left_out: how many rows are left out, and why in words; empty for a whole file."""
+    """The content of a PLY file. left_out: how many rows are left out, and why in words; empty for a whole file.
+
+    harmonics: coefficients of the spherical harmonics above degree 0 for each channel; k is 0, 3, 8 or 15.
+    """
 
     gaussians: Gaussians
     world_frame: str
+    harmonics: Float32[ndarray, "n 3 k"]
     left_out: int = 0
     reason: str = ""
 
 
-def write_ply(path: Path, gaussians: Gaussians, world_frame: str = "") -> None:
+def write_ply(
+    path: Path, gaussians: Gaussians, world_frame: str = "", harmonics: Float32[ndarray, "n 3 k"] | None = None
+) -> None:
     """Write the map atomically; the header names the world frame unless it is empty.
 
     Raises InvalidInputError for a name with line breaks or control characters, StorageError if writing fails.
     """
-    write_atomic(path, ply_bytes(gaussians, world_frame))
+    write_atomic(path, ply_bytes(gaussians, world_frame, harmonics))
 
 
 def read_ply(path: Path, warn: Callable[[str], object] = warnings.warn) -> Gaussians:
-    """Read a map. Rows with NaN, or infinite where no map can be, are left out; warn: called with a line that says so.
+    """Read a map without harmonics. Rows with NaN, or infinite where no map can be, are left out.
 
-    Raises MapFileError naming the file and the cause.
+    warn: called with a line on what is left out. Raises MapFileError naming the file and the cause.
     """
     stored = read_stored_map(path)
     if stored.left_out:
         warn(f"{path}: {left_out_note(stored)}")
+    if stored.harmonics.any():
+        warn(f"{path}: left out {HARMONICS}: a Gaussian has one colour here; `gausslite render` shows all")
     return stored.gaussians
 
 
@@ -97,10 +111,14 @@ def read_world_frame(path: Path) -> str:
         return world_frame_from_ply(file.read(_MAX_HEADER_BYTES))
 
 
-def ply_bytes(gaussians: Gaussians, world_frame: str = "") -> bytes:
+def ply_bytes(gaussians: Gaussians, world_frame: str = "", harmonics: Float32[ndarray, "n 3 k"] | None = None) -> bytes:
     """Encode the map as the bytes of a PLY file. Raises InvalidInputError as `write_ply`."""
     require_name("world frame", world_frame)
-    rows = np.zeros(len(gaussians), _ROW)
+    rest_names = () if harmonics is None else tuple(f"{_REST}{i}" for i in range(3 * harmonics.shape[2]))
+    names = (*_POSITIONS, *_COLOURS, *rest_names, "opacity", *_SCALES, *_ROTATIONS, *_EXTRAS)
+    rows = np.zeros(len(gaussians), [(name, "<f4") for name in names])
+    if harmonics is not None:
+        _fill(rows, rest_names, harmonics.reshape(len(gaussians), len(rest_names)))
     opacity = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
     _fill(rows, _POSITIONS, gaussians.means_m)
     _fill(rows, _COLOURS, ((gaussians.rgb - 0.5) / SH_C0).astype(np.float32))
@@ -113,7 +131,7 @@ def ply_bytes(gaussians: Gaussians, world_frame: str = "") -> bytes:
     if world_frame:
         header.append(_WORLD_FRAME_COMMENT + quote(world_frame, _PRINTABLE))
     header.append(f"element vertex {len(gaussians)}")
-    header += [f"property float {name}" for name in (*_STANDARD, *_EXTRAS)]
+    header += [f"property float {name}" for name in names]
     return ("\n".join([*header, "end_header"]) + "\n").encode("ascii") + rows.tobytes()
 
 
@@ -152,14 +170,18 @@ def _stored_map(data: bytes) -> StoredMap:
     )
     checked = {**dict(zip(_STANDARD, converted.T, strict=True)), **{n: columns[n] for n in _EXTRAS if n in columns}}
     finite = {name: np.isfinite(values) for name, values in checked.items()}
+    harmonics = columns[_REST].reshape(count, 3, columns[_REST].shape[1] // 3)
+    if harmonics.size:
+        finite[_REST] = np.isfinite(harmonics).all(axis=(1, 2))
     broken = [name for name, values in finite.items() if not values.all()]
     if not broken:
-        return StoredMap(gaussians, world_frame_from_ply(data))
+        return StoredMap(gaussians, world_frame_from_ply(data), harmonics)
     kept = np.logical_and.reduce(list(finite.values()))
     reason = f"column {broken[0]}: expected finite values, got NaN or infinity"
     if not kept.any():
         raise MapFileError(reason)
-    return StoredMap(gaussians.take(kept), world_frame_from_ply(data), int(np.count_nonzero(~kept)), reason)
+    left_out = int(np.count_nonzero(~kept))
+    return StoredMap(gaussians.take(kept), world_frame_from_ply(data), harmonics[kept], left_out, reason)
 
 
 def _to_gaussians(raw: Mapping[str, NDArray[Any]], count: int) -> Gaussians:
@@ -199,10 +221,14 @@ def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
     if missing:
         raise MapFileError(f"expected the columns of a 3DGS map, missing {', '.join(missing)}")
     present = [name for name in (*_STANDARD, *_EXTRAS) if name in vertex.fields]
+    rest = [f"{_REST}{i}" for i in range(sum(name.startswith(_REST) for name in vertex.fields))]
+    if len(rest) not in _REST_COUNTS or not vertex.fields.keys() >= set(rest):
+        rest = []
     if file_format == _ASCII:
         table = _ascii_rows(data[start:], sum(element.count for element in before), vertex)
-        places = list(vertex.fields)
-        return {name: table[:, places.index(name)] for name in present}, vertex.count
+        places = {name: place for place, name in enumerate(vertex.fields)}
+        harmonics = table[:, [places[name] for name in rest]].astype(np.float32)
+        return {**{name: table[:, places[name]] for name in present}, _REST: harmonics}, vertex.count
     for element in (*before, vertex):
         if element.has_list:
             raise MapFileError(f"element {element.name}: expected columns of one size up to the vertices, got a list")
@@ -213,7 +239,8 @@ def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
         got = f"{max(len(data) - start, 0)} bytes of them"
         raise MapFileError(f"expected {vertex.count} Gaussians of {row.itemsize} bytes, got {got}")
     rows = np.frombuffer(data, row, vertex.count, start)
-    return {name: rows[name] for name in present}, vertex.count
+    harmonics = structured_to_unstructured(rows[rest], np.float32) if rest else np.zeros((vertex.count, 0), np.float32)
+    return {**{name: rows[name] for name in present}, _REST: harmonics}, vertex.count
 
 
 def _row_type(element: _Element, byte_order: str) -> np.dtype[np.void]:
@@ -262,7 +289,7 @@ def _header_extent(data: bytes) -> tuple[int, int]:
     """Return the offsets of the header's last line and of the first row."""
     end = data.find(b"\nend_header", 0, _MAX_HEADER_BYTES) + 1
     if not data.startswith(b"ply") or end == 0:
-        raise MapFileError("expected a PLY file, got something else")
+        raise MapFileError(f"expected a PLY file, got {foreign_format(data[:FOREIGN_BYTES]) or 'something else'}")
     start = data.find(b"\n", end, end + 12) + 1
     if start == 0:
         raise MapFileError("the header has no end")

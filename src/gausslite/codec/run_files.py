@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.codec.state_file import read_png, read_state, write_atomic, write_png, write_state
+from gausslite.codec.state_file import read_state, write_atomic, write_png, write_state
 from gausslite.codec.subset_codec import CodecLimits, decode_subset, encode_subset
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
@@ -137,7 +137,7 @@ def read_map_history(folder: Path) -> tuple[MapSnapshot, ...]:
     )
 
 
-_FOLDER, _PHOTOGRAPH, _ROI = "views", ".png", ".roi.png"
+VIEWS, PHOTOGRAPH, ROI = "views", ".png", ".roi.png"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,28 +158,14 @@ class ViewImage:
 
 def write_view_images(folder: Path, images: Sequence[ViewImage]) -> None:
     """Write `views/FRAME.png` and `views/FRAME.roi.png`; earlier views are removed. Raises StorageError."""
-    target = folder / _FOLDER
+    target = folder / VIEWS
     try:
         target.mkdir(exist_ok=True)
-        for earlier in target.glob(f"*{_PHOTOGRAPH}"):
+        for earlier in target.glob(f"*{PHOTOGRAPH}"):
             earlier.unlink()
     except OSError as error:
         raise StorageError(f"{target}: cannot be written: {error.strerror}") from error
     for image in images:
-        write_png(target / f"{image.index:06d}{_PHOTOGRAPH}", image.photograph)
+        write_png(target / f"{image.index:06d}{PHOTOGRAPH}", image.photograph)
         mask = np.repeat(image.roi[..., None].astype(np.uint8) * 255, 3, axis=2)
-        write_png(target / f"{image.index:06d}{_ROI}", mask)
-
-
-def read_view_images(folder: Path) -> list[ViewImage]:
-    """Read the views of a results folder by frame index; an empty list without any. Raises MapFileError."""
-    images = []
-    for path in sorted((folder / _FOLDER).glob(f"*{_PHOTOGRAPH}")):
-        if path.name.endswith(_ROI):
-            continue
-        roi_path = path.with_name(path.stem + _ROI)
-        photograph, roi = read_png(path), read_png(roi_path)[..., 0] > 0
-        if not path.stem.isdecimal() or photograph.shape[:2] != roi.shape:
-            raise MapFileError(f"{path}: expected a photograph FRAME.png as large as {roi_path.name}, got another file")
-        images.append(ViewImage(int(path.stem), photograph, roi))
-    return images
+        write_png(target / f"{image.index:06d}{ROI}", mask)

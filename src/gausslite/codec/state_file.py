@@ -95,20 +95,6 @@ def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
     write_atomic(path, encoded.tobytes())
 
 
-def read_png(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """Read an RGB image. Raises MapFileError naming the file."""
-    import cv2
-
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise MapFileError(f"{path}: expected a PNG file, got {error.strerror}") from error
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if image is None:
-        raise MapFileError(f"{path}: expected a PNG file, got an unreadable one")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-
-
 FORMAT = "gausslite-state"
 VERSION = "2"
 _TYPES = {"BOOL", "U8", "I16", "I32", "U32", "I64", "U64", "F32", "F64"}

@@ -9,10 +9,18 @@ from typing import Any, NoReturn
 from gausslite.config.option import nearest, suggestion
 from gausslite.config.plain_values import describe_range, is_within, read_plain, without_password
 from gausslite.domain.errors import InvalidInputError
-from gausslite.process import printable
+from gausslite.process import installed_version, printable
 
 PARSER = "_parser"
 """Name of the chosen command's parser among parsed arguments."""
+
+
+class _PrintVersion(argparse.Action):
+    """Print the version of the installed distribution, which is looked up only on request."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(parser.prog, installed_version())
+        parser.exit()
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -23,6 +31,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{**options, "allow_abbrev": False})
+        self.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
         # that of the chosen sub-command, whose help has the options
         self.set_defaults(**{PARSER: self})
 

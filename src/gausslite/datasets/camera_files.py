@@ -1,23 +1,24 @@
-"""Read the camera of a folder's or bag's file: JSON with depth units, ROS's camera_info, COLMAP's cameras, a matrix."""
+"""Read the camera of a folder's or bag's file: JSON with depth units, ROS's camera_info, a matrix, others' formats."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, cast
 
 import numpy as np
 
 from gausslite.datasets.files import parse_numbers, read_rows, read_text
 from gausslite.domain.camera import Camera, FileIntrinsics, Lens, LensModel
 from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.plugins import Group, installed
 
 INTRINSICS_FILE = "camera-intrinsics.txt"
 CAMERA_FILE = "cam_params.json"
 CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
-COLMAP_FILE = "cameras.txt"
 _MIN_UNITS_PER_METRE = 0.1
 """Smaller values are metres per unit, the reciprocal."""
 
@@ -48,19 +49,36 @@ class FolderCamera:
     depth_registered: bool | None = None
 
 
+class CameraReader(Protocol):
+    """Reads the camera of another tool's files. A package registers it in the group `gausslite.cameras`."""
+
+    @property
+    def patterns(self) -> tuple[str, ...]:
+        """Patterns of the files' names."""
+        ...
+
+    def read(self, path: Path, width_px: int, height_px: int, /) -> FolderCamera | None:
+        """Return the camera for images of this size; None for a file of another kind. Raises DatasetError."""
+        ...
+
+
 def read_folder_camera(
     folder: Path, width_px: int, height_px: int, published: FolderCamera | None = None
 ) -> FolderCamera | None:
     """Return the camera of a file in the folder, else the published one, else that of a file one folder above.
 
     A file above may belong to another recording: it is used only for images of its size, with a note. Read in this
-    order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP), camera-intrinsics.txt (a
-    matrix). Returns None without a camera. Raises DatasetError.
+    order: cam_params.json (with depth units), camera_info.yaml (ROS), camera-intrinsics.txt (a matrix), files of the
+    installed readers. Returns None without a camera. Raises DatasetError.
     """
-    names = (CAMERA_FILE, *CAMERA_INFO_FILES, COLMAP_FILE, INTRINSICS_FILE)
+    names = (CAMERA_FILE, *CAMERA_INFO_FILES, INTRINSICS_FILE)
     for path in (folder / name for name in names):
         if path.is_file():
             return read_camera_file(path, width_px, height_px)
+    for _, reader in installed(Group.CAMERAS):
+        for path in sorted(path for pattern in reader.patterns for path in folder.glob(pattern)):
+            if (other := reader.read(path, width_px, height_px)) is not None:
+                return cast(FolderCamera, other)
     if published is not None:
         return published
     for path in (folder.absolute().parent / name for name in names):
@@ -72,16 +90,18 @@ def read_folder_camera(
 
 
 def read_camera_file(path: Path, width_px: int, height_px: int) -> FolderCamera:
-    """Return the camera of a file by its name: *.json, *.yaml, cameras.txt of COLMAP, or another text with a matrix.
+    """Return the camera of a file: of an installed reader, or by its name *.json, *.yaml, or a text with a matrix.
 
     The size is that of the images; only a matrix does not state it. Raises DatasetError.
     """
+    is_own = path.name in (CAMERA_FILE, *CAMERA_INFO_FILES, INTRINSICS_FILE)
+    for _, reader in () if is_own else installed(Group.CAMERAS):
+        if any(map(path.match, reader.patterns)) and (found := reader.read(path, width_px, height_px)) is not None:
+            return cast(FolderCamera, found)
     if path.suffix == ".json":
         return read_json_camera(path)
     if path.suffix in (".yaml", ".yml"):
         return read_camera_info(path)
-    if path.name == COLMAP_FILE:
-        return read_colmap_camera(path)
     return FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))
 
 
@@ -104,7 +124,8 @@ def read_json_camera(path: Path) -> FolderCamera:
     belongs to the colour pixels. Raises DatasetError.
     """
     try:
-        fields = json.loads(read_text(path))["camera"]
+        loaded = json.loads(read_text(path))
+        fields = loaded.get("camera", loaded)
         numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
         lens = lens_of(str(path), fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -141,48 +162,6 @@ def read_camera_info(path: Path) -> FolderCamera:
         reason = " ".join(str(error).split())[:120]
         raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {reason}") from None
     return FolderCamera(intrinsics.camera(str(path), width, height), lens=lens)
-
-
-_COLMAP_LENSES: Mapping[str, Callable[[Sequence[float]], tuple[float, ...]]] = {
-    "SIMPLE_PINHOLE": lambda p: (p[0], p[0], p[1], p[2]),
-    "PINHOLE": lambda p: (p[0], p[1], p[2], p[3]),
-    "SIMPLE_RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0),
-    "RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0),
-    "OPENCV": lambda p: tuple(p[:8]),
-    "FULL_OPENCV": lambda p: tuple(p[:12]),
-    "OPENCV_FISHEYE": lambda p: tuple(p[:8]),
-    "SIMPLE_RADIAL_FISHEYE": lambda p: (p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0),
-    "RADIAL_FISHEYE": lambda p: (p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0),
-}
-"""Parameters of COLMAP's camera models as fx fy cx cy and OpenCV's distortion coefficients."""
-
-
-def read_colmap_camera(path: Path) -> FolderCamera:
-    """Return the camera of COLMAP's cameras.txt, whose principal point counts from the image corner.
-
-    Raises DatasetError, also for several cameras that differ: which one took an image is not in this file.
-    """
-    rows = read_rows(path)
-    location, fields = rows[0] if rows else (str(path), [])
-    others = sum(other[1:] != fields[1:] for _, other in rows[1:])
-    if others:
-        raise DatasetError(
-            f"{path}: expected one camera, got {1 + others} that differ; leave the one that took the images"
-        )
-    model = fields[1] if len(fields) > 1 else ""
-    if model not in _COLMAP_LENSES:
-        raise DatasetError(
-            f"{location}: expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of "
-            f"{', '.join(_COLMAP_LENSES)}, got {model[:30]!r}"
-        )
-    numbers = parse_numbers(location, fields[2:], len(fields) - 2, "a camera's size and parameters")
-    try:
-        fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
-    except (IndexError, ValueError):
-        raise DatasetError(f"{location}: expected more parameters for {model}, got {len(numbers) - 2}") from None
-    lens = lens_of(str(path), "equidistant" if model.endswith("FISHEYE") else "plumb_bob", distortion)
-    camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
-    return FolderCamera(camera, lens=lens)
 
 
 _LENS_MODELS = {

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_size
 from gausslite.domain.errors import DatasetError
+from gausslite.domain.file_formats import FOREIGN_BYTES, foreign_format
 from gausslite.domain.frame import Frame, image_size
 
 _MAX_IMAGE_PX = 1 << 26
@@ -178,7 +179,8 @@ def decode_image(location: str, data: bytes, flags: int) -> NDArray[Any]:
     and checksums are checked before memory is taken. Raises DatasetError with the location.
     """
     if not data.startswith((_PNG_MAGIC, _JPEG_MAGIC)):
-        got = f"another format, which begins with {data[:16]!r}" if data else "an empty file"
+        other = foreign_format(data[:FOREIGN_BYTES]) or f"another format, which begins with {data[:16]!r}"
+        got = other if data else "an empty file"
         raise DatasetError(f"{location}: expected a PNG or JPEG image, got {got}")
     size_px = image_size(data)
     if size_px is not None:
@@ -229,18 +231,19 @@ def _size(image: NDArray[Any]) -> str:
 
 
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_GZIP = b"\x1f\x8b"
 _NOT_A_NUMBER = re.compile(r"[-+]?(?:nan\(.*\)|1\.#(?:QNAN|SNAN|IND)\w*)|NA", re.IGNORECASE)
 """NaN as the C library of Windows and tables of R write it."""
-_SEPARATORS = re.compile(r"[\s,;\"']+")
+_SEPARATORS, _OTHER_SEPARATORS = re.compile(r"[\s,;\"']+"), re.compile(r"[\s;\"']+")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+|[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 
 def read_text(path: Path) -> str:
     """Return the text of UTF-8, of UTF-16 with a mark (PowerShell), or else of Latin-1. Raises DatasetError."""
     try:
         data = path.read_bytes()
-        if data.startswith(_GZIP):
-            raise DatasetError(f"{path}: expected a text file, got one that gzip compressed; unpack it")
+        foreign = foreign_format(data[:FOREIGN_BYTES])
+        if foreign and not data.lstrip().startswith(b"{"):
+            raise DatasetError(f"{path}: expected a text file, got {foreign}")
         if data.startswith(_UTF_16):
             return data.decode("utf-16")
         try:
@@ -267,9 +270,22 @@ def read_rows(path: Path) -> list[tuple[str, list[str]]]:
 
     Quotes, empty rows and a header of words are left out, as spreadsheets write them.
     """
-    rows = [(location, [field for field in _SEPARATORS.split(text) if field]) for location, text in read_lines(path)]
+    lines = read_lines(path)
+    require_points(lines)
+    rows = [(location, [field for field in _SEPARATORS.split(text) if field]) for location, text in lines]
     rows = [(location, fields) for location, fields in rows if fields]
     return rows[1:] if rows and not any(map(is_number, rows[0][1])) else rows
+
+
+def require_points(lines: Iterable[tuple[str, str]]) -> None:
+    """Raise DatasetError for numbers with a decimal comma, among separators that are none: commas separate fields."""
+    for location, text in lines:
+        fields = [field for field in _OTHER_SEPARATORS.split(text) if field.strip(",")]
+        with_comma = [field for field in fields if "," in field]
+        if len(fields) > 1 and with_comma and all(map(_DECIMAL_COMMA.fullmatch, with_comma)):
+            raise DatasetError(
+                f"{location}: expected a point as the decimal mark, got the decimal comma of {with_comma[0]!r}"
+            )
 
 
 def is_number(text: str) -> bool:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
-from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -15,13 +13,13 @@ from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera
-from gausslite.datasets.files import DepthUnits, load_rgbd, parse_numbers, read_rows
+from gausslite.datasets.files import DepthUnits, parse_numbers, read_rows
 from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, load_voxel_regions
-from gausslite.datasets.source import Source, excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.frame import MAX_COORDINATE_M, Frame
-from gausslite.domain.pose import Trajectory, UpAxis, require_rigid
+from gausslite.domain.frame import MAX_COORDINATE_M
+from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.relevance import Region
 
 _REPAIRABLE_DEVIATION = 0.05
@@ -125,7 +123,6 @@ def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) 
 
 _ORIGIN_STEP_M = 10_000.0
 _EARTH_DIAMETER_M = 1.3e7
-_ORIGIN_POSES = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,9 +162,6 @@ class Origin:
     def __str__(self) -> str:
         """Return the coordinates."""
         return " ".join(f"{value:.0f}" for value in self.position_m)
-
-
-_RATE_HZ = 30
 
 
 class FolderSource(Source):
@@ -257,86 +251,6 @@ class FolderSource(Source):
         return {} if path is None else balls_for_small_objects(load_voxel_regions(path))
 
 
-class NumberedFolderSource(FolderSource):
-    """Numbered image files at 30 Hz. Frames without a pose are excluded, or have the identity if none is required."""
-
-    _colours: dict[int, Path]
-    _numbers: list[int]
-    _require_poses: bool
-
-    def _find_colours(self, folder: Path, paths: Iterable[Path], pattern: re.Pattern[str], expected: str) -> None:
-        """Find the colour images by their names. Raises DatasetError if there are none."""
-        matches = (pattern.fullmatch(path.name) for path in paths)
-        colours = {int(match.group(1)): folder / match.group(0) for match in matches if match}
-        require_frames(folder, len(colours), f"images named {expected}")
-        self._colours = dict(sorted(colours.items()))
-
-    def _select_frames(self, require_poses: bool) -> None:
-        """Exclude the frames without a pose if poses are required. Raises DatasetError if none is left."""
-        self._require_poses = require_poses
-        self._numbers = [number for number in self._colours if not require_poses or not self._is_lost(number)]
-        require_frames(self._folder, len(self._numbers), "frames with a pose")
-        some = self._numbers[:: -(-len(self._numbers) // _ORIGIN_POSES)]
-        positions_m = [self._read_matrix(number)[:3, 3] for number in some if self._has_pose(number)]
-        self._origin = Origin.near(np.array(positions_m).reshape(-1, 3))
-
-    @abstractmethod
-    def _depth_path(self, number: int) -> Path:
-        """Return the path of a frame's depth image."""
-
-    @abstractmethod
-    def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
-        """Return a frame's pose as its file states it. Raises DatasetError."""
-
-    @abstractmethod
-    def _pose_location(self, number: int) -> str:
-        """Return the file, or the file and row, of a frame's pose, for error messages."""
-
-    @property
-    def excluded_frames(self) -> str:
-        """Message on the frames without a pose."""
-        return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        """Return the frame at position i. Raises DatasetError, PoseError."""
-        require_position(self.name, i, len(self))
-        number = self._numbers[i]
-        T_world_camera = self._read_pose(number)
-        image = load_rgbd(self._colours[number], self._depth_path(number), self._camera, self._units, size)
-        return image.frame(number, number * 10**9 // _RATE_HZ, T_world_camera)
-
-    def indices(self) -> Sequence[int]:
-        """Return the numbers in the file names."""
-        return list(self._numbers)
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses at the frames' times."""
-        poses = [self._read_pose(number) for number in self._numbers]
-        return Trajectory(np.array(self._numbers) / _RATE_HZ, np.array(poses))
-
-    def _is_lost(self, number: int) -> bool:
-        try:
-            T = self._read_matrix(number)
-            return is_lost(T[:3, 3], T[:3, :3])
-        except (DatasetError, PoseError):
-            return False  # `frame` reports a damaged pose if it is used
-
-    def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
-        if not self._require_poses and not self._has_pose(number):
-            return np.eye(4)
-        return self._origin.moved(nearest_rigid(self._pose_location(number), self._read_matrix(number)))
-
-    def _has_pose(self, number: int) -> bool:
-        try:
-            T = self._read_matrix(number)
-            return not is_lost(T[:3, 3], T[:3, :3])
-        except (DatasetError, PoseError):
-            return False
-
-
 class FolderSourceClass(Protocol):
     """A class of sequences in folders or files, which it recognises by the names of files."""
 
@@ -401,12 +315,19 @@ def quat_xyzw(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
     return np.append(0.5 * np.sinc(half / np.pi) * rotation_rad, np.cos(half))
 
 
+MAX_POSE_GAP_S = 1.0
+"""Longest time between two poses to interpolate: slow localisation nodes publish map → odom once a second."""
+_ROUNDING_S = 1e-6
+"""Times are written in microseconds: a limit that they meet exactly is not exceeded."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTrack:
     """Poses T_parent_child at ascending times, with quaternions of about unit length in the order x y z w.
 
     location: file or topic, for error messages. Between two poses at most max_gap_s apart, positions are interpolated
-    linearly and rotations by slerp. In longer gaps and outside, a pose within max_lag_s is used.
+    linearly and rotations by slerp. In longer gaps, in those with a time at which tracking was lost (lost_s, ascending)
+    and outside, a pose within max_lag_s is used.
     """
 
     location: str
@@ -415,6 +336,7 @@ class PoseTrack:
     quats_xyzw: Float64[ndarray, "n 4"]
     max_gap_s: float
     max_lag_s: float
+    lost_s: Float64[ndarray, " m"] = field(default_factory=lambda: np.zeros(0))
 
     def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
         """Return the interpolated pose, or None if there is none near this time. Raises PoseError."""
@@ -422,10 +344,11 @@ class PoseTrack:
         after = int(np.searchsorted(times, time_s))
         before, after = max(after - 1, 0), min(after, len(times) - 1)
         gap_s = float(times[after] - times[before])
-        if before == after or gap_s > self.max_gap_s:
+        first_lost, last_lost = np.searchsorted(self.lost_s, (times[before], times[after]))
+        if before == after or gap_s > self.max_gap_s + _ROUNDING_S or first_lost < last_lost:
             # trajectories of keyframes have poses far apart, each at the timestamp of its image
             nearest = int(np.abs(times - time_s).argmin())
-            if abs(float(times[nearest]) - time_s) > self.max_lag_s:
+            if abs(float(times[nearest]) - time_s) > self.max_lag_s + _ROUNDING_S:
                 return None
             before, after, gap_s = nearest, nearest, 0.0
         share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0

@@ -9,22 +9,16 @@ from typing import Final
 from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.corrected import UndistortedColourSource
 from gausslite.datasets.folder import FolderReader
-from gausslite.datasets.replica import ReplicaSource
-from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source, SourceReader
 from gausslite.datasets.tum import TumSource
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
+from gausslite.domain.file_formats import foreign_file
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, installed, load, names
 
-_LAYOUTS: Final[tuple[SourceReader, ...]] = (
-    FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"),
-    FolderReader(SevenScenesSource, "7-Scenes (frame-000000.color.png ...)"),
-    FolderReader(ReplicaSource, "Replica (results/frame000000.jpg, traj.txt)"),
-)
-_COMPRESSED = (".zip", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".7z", ".zst", ".zstd", ".lz4")
+_TUM: Final[SourceReader] = FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)")
 
 
 def open_source(
@@ -79,8 +73,8 @@ def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
 
 
 def _readers() -> Iterator[SourceReader]:
-    """Yield those of the core first: the packages of others are imported only if they are asked."""
-    yield from _LAYOUTS
+    """Yield that of the core first: the packages of others are imported only if they are asked."""
+    yield _TUM
     for _, reader in installed(Group.SOURCES):
         yield reader
 
@@ -108,7 +102,7 @@ def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
 def _unknown_address(spec: str, path: Path) -> DatasetError:
     found = "nothing there"
     if path.is_file():
-        found = "a compressed file; unpack it first" if path.suffix.lower() in _COMPRESSED else "a file"
+        found = foreign_file(path) or "a file"
     expected = _alternatives(["a folder with a sequence", *(reader.address for reader in _readers())])
     return DatasetError(f"{spec}: expected {expected}; got {found}{_absent_readers()}")
 

@@ -7,8 +7,9 @@ from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
@@ -306,76 +307,30 @@ def _is_whole(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) <= 20
 
 
+def _of_wrapped(name: str) -> Any:
+    """Return a property that has the wrapped source's value."""
+    return property(attrgetter(f"_source.{name}"))
+
+
 class WrappedSource(Source):
     """All of a Source except `frame`, as the wrapped source has it; subclasses override what they change."""
 
+    name = _of_wrapped("name")
+    camera = _of_wrapped("camera")
+    lens = _of_wrapped("lens")
+    up_axis = _of_wrapped("up_axis")
+    depth_registered = _of_wrapped("depth_registered")
+    camera_ideal = _of_wrapped("camera_ideal")
+    poses_exact = _of_wrapped("poses_exact")
+    depth_unit_stated = _of_wrapped("depth_unit_stated")
+    depth_unit_setting = _of_wrapped("depth_unit_setting")
+    world_frame = _of_wrapped("world_frame")
+    regions_file = _of_wrapped("regions_file")
+    description = _of_wrapped("description")
+    notes = _of_wrapped("notes")
+
     def __init__(self, source: Source) -> None:
         self._source = source
-
-    @property
-    def name(self) -> str:
-        """Name of the wrapped source."""
-        return self._source.name
-
-    @property
-    def camera(self) -> Camera:
-        """Camera of the wrapped source."""
-        return self._source.camera
-
-    @property
-    def lens(self) -> Lens | None:
-        """Lens of the wrapped source."""
-        return self._source.lens
-
-    @property
-    def up_axis(self) -> UpAxis:
-        """Upward direction of the wrapped source."""
-        return self._source.up_axis
-
-    @property
-    def depth_registered(self) -> bool:
-        """True if the wrapped source's depth is registered."""
-        return self._source.depth_registered
-
-    @property
-    def camera_ideal(self) -> bool:
-        """True if the wrapped source's camera is ideal."""
-        return self._source.camera_ideal
-
-    @property
-    def poses_exact(self) -> bool:
-        """True if the wrapped source's poses are exact."""
-        return self._source.poses_exact
-
-    @property
-    def depth_unit_stated(self) -> bool:
-        """As the wrapped source has it."""
-        return self._source.depth_unit_stated
-
-    @property
-    def depth_unit_setting(self) -> str:
-        """As the wrapped source has it."""
-        return self._source.depth_unit_setting
-
-    @property
-    def world_frame(self) -> str:
-        """World frame of the wrapped source."""
-        return self._source.world_frame
-
-    @property
-    def regions_file(self) -> Path | None:
-        """Region file of the wrapped source."""
-        return self._source.regions_file
-
-    @property
-    def description(self) -> str:
-        """As the wrapped source has it."""
-        return self._source.description
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Messages of the wrapped source."""
-        return self._source.notes
 
     def __len__(self) -> int:
         return len(self._source)

@@ -20,8 +20,17 @@ from gausslite.datasets.files import (
     parse_numbers,
     read_lines,
     read_rows,
+    require_points,
 )
-from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, Origin, PoseTrack, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import (
+    FIRST_VIEW_UP,
+    MAX_POSE_GAP_S,
+    FolderSource,
+    Origin,
+    PoseTrack,
+    is_lost,
+    pose_from_quaternion,
+)
 from gausslite.datasets.source import (
     excluded_frames_note,
     repeated_times_note,
@@ -38,8 +47,7 @@ _POSES = "groundtruth.txt"
 _LISTS = ("rgb.txt", "depth.txt", _POSES)
 _SEPARATOR = re.compile(r"[\s,;\"']+")
 """Separates a time from the rest of its row."""
-_MAX_DEPTH_LAG_S = 0.020
-_MAX_POSE_GAP_S = 0.100
+_MAX_DEPTH_LAG_S, _ROUNDING_S = 0.020, 1e-6
 _MAX_TIME_S = 9e9
 """Larger times, of the year 2255, do not fit into 64 bits as nanoseconds."""
 _MAX_POSE_LAG_S = 0.010
@@ -71,7 +79,7 @@ class TumSource(FolderSource):
     """A folder with rgb.txt, depth.txt and groundtruth.txt.
 
     A colour image is associated with the nearest depth image within 20 ms. Its pose is interpolated (lerp and slerp)
-    between two poses at most 0.1 s apart; if there are none, a pose within 10 ms is used. Colour images without depth
+    between two poses at most 1 s apart; if there are none, a pose within 10 ms is used. Colour images without depth
     or pose are excluded, and those with the time of the one before. Poses without a finite number or with a quaternion
     of zeros count as missing. Frame numbers are the rows of rgb.txt from 0. Raises DatasetError, PoseError.
     """
@@ -98,7 +106,7 @@ class TumSource(FolderSource):
     @property
     def excluded_frames(self) -> str:
         """Message on the colour images that repeat a time, or without depth or pose at their time."""
-        reason = "without a pose at their time or depth within 20 ms"
+        reason = "without poses around them at most 1 s apart, or depth within 20 ms"
         unmatched = excluded_frames_note(self._recorded - self._repeated - len(self), self._recorded, reason)
         return "; ".join(filter(None, (repeated_times_note(self._repeated, self._recorded), unmatched)))
 
@@ -140,7 +148,7 @@ def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int, in
         T_world_camera = None if trajectory is None else trajectory.at(time_s)
         if T_world_camera is None and not require_poses:
             T_world_camera = np.eye(4)
-        if abs(depth_times[nearest] - time_s) <= _MAX_DEPTH_LAG_S and T_world_camera is not None:
+        if abs(depth_times[nearest] - time_s) <= _MAX_DEPTH_LAG_S + _ROUNDING_S and T_world_camera is not None:
             depth = folder / depth_names[nearest]
             matches.append(_Match(number, time_s, folder / name, depth, T_world_camera))
     expected = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
@@ -157,7 +165,9 @@ def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
         found = f"; the folder has {', '.join(others[:8])}: name the list of images {path.name}" if others else ""
         raise DatasetError(f"{path}: expected a text file, got none{found}")
     times, names = [], []
-    rows = [(location, _SEPARATOR.split(text.strip("\"'"), maxsplit=1)) for location, text in read_lines(path)]
+    lines = read_lines(path)
+    require_points(lines)
+    rows = [(location, _SEPARATOR.split(text.strip("\"'"), maxsplit=1)) for location, text in lines]
     for location, fields in rows[1:] if rows and not is_number(rows[0][1][0]) else rows:
         name = _file_name(path.parent, fields[-1])
         if len(fields) != 2 or name is None:
@@ -200,7 +210,8 @@ def _read_poses(path: Path, required: bool) -> PoseTrack | None:
     if not (np.isfinite(table[:, 0]).all() and (np.diff(table[:, 0]) >= 0).all()):
         raise DatasetError(f"{path}: expected finite times in ascending order")
     times_s, translations_m, quats_xyzw = table[known, 0], table[known, 1:4], table[known, 4:8]
-    return PoseTrack(str(path), times_s, translations_m, quats_xyzw, _MAX_POSE_GAP_S, _MAX_POSE_LAG_S)
+    lost_s = table[~known, 0]
+    return PoseTrack(str(path), times_s, translations_m, quats_xyzw, MAX_POSE_GAP_S, _MAX_POSE_LAG_S, lost_s=lost_s)
 
 
 def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
@@ -213,9 +224,10 @@ def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera
     published = None
     if group is not None and width_px * _PUBLISHED_SIZE_PX[1] == height_px * _PUBLISHED_SIZE_PX[0]:
         camera = _INTRINSICS[group.group(1)].camera(str(folder), *_PUBLISHED_SIZE_PX).resized(width_px, height_px)
-        note = f"the published camera of fr{group.group(1)} is scaled from 640x480 to {width_px}x{height_px}"
         is_scaled = (width_px, height_px) != _PUBLISHED_SIZE_PX
-        published = FolderCamera(camera, lens=_LENSES.get(group.group(1)), note=note if is_scaled else "")
+        scaled = f", scaled from 640x480 to {width_px}x{height_px}" if is_scaled else ""
+        note = f"the camera is the published one of fr{group.group(1)}, by the folder's name{scaled}"
+        published = FolderCamera(camera, lens=_LENSES.get(group.group(1)), note=note)
     found = read_folder_camera(folder, width_px, height_px, published)
     if found is None:
         raise DatasetError(

@@ -107,7 +107,19 @@ def _repeated(blocks: Float32[ndarray, "bh bw"], times: int, shape: tuple[int, .
     return image[: shape[0], : shape[1]]
 
 
+MAX_DEPTH_M = 65.535
+"""Farthest depth on the wire; no sensor measures a room beyond it."""
+_FAR_SHARE = 0.9
 NO_DEPTH, ONE_COLOUR = "no pixel has a depth reading", "the colour image has one colour"
+TOO_FAR = "depth lies beyond 65.5 m, as millimetres that are read as metres do"
+
+
+def is_too_far(depth_m: Float32[ndarray, "h w"]) -> bool:
+    """True if nearly all readings are farther than any sensor measures, so that their unit is another one."""
+    measured, far = np.count_nonzero(depth_m), np.count_nonzero(depth_m >= np.float32(MAX_DEPTH_M))
+    return bool(far > _FAR_SHARE * measured)
+
+
 MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 
@@ -183,6 +195,8 @@ class Frame:
         """
         if not self.has_depth:
             return NO_DEPTH
+        if is_too_far(self.depth_m):
+            return TOO_FAR
         step = max(1, math.isqrt(self.depth_m.size // _COLOUR_SAMPLES))
         colours = self.rgb[::step, ::step].reshape(-1, 3)
         median = np.median(colours, axis=0)

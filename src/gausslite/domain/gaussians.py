@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,6 +12,8 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.arrays import require_array
+from gausslite.domain.checks import describe
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import transform_points
 
 
@@ -58,10 +61,18 @@ class Gaussians:
             target=np.zeros(0, np.int16),
         )
 
-    def take(self, rows: NDArray[Any]) -> Gaussians:
-        """Return the Gaussians at these indices, or where this boolean mask is True."""
-        indices = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        return Gaussians(*(np.take(getattr(self, field.name), indices, axis=0) for field in fields(self)))
+    def take(self, rows: NDArray[Any] | Sequence[int] | Sequence[bool]) -> Gaussians:
+        """Return the Gaussians at these indices, or where this boolean mask is True. Raises InvalidInputError."""
+        chosen = np.asarray(rows)
+        try:
+            if chosen.dtype == np.bool_:
+                chosen = np.arange(len(self))[chosen]
+            # an empty list has the type of floats
+            indices = chosen.astype(np.int64, casting="same_kind" if chosen.size else "unsafe", copy=False)
+            return Gaussians(*(np.take(getattr(self, field.name), indices, axis=0) for field in fields(self)))
+        except (IndexError, TypeError):
+            expected = f"indices below {len(self)} or {len(self)} booleans"
+            raise InvalidInputError(f"rows: expected {expected}, got {describe(rows)}") from None
 
     @classmethod
     def concatenate(cls, parts: list[Gaussians]) -> Gaussians:

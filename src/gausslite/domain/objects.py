@@ -39,8 +39,8 @@ class NounMatch:
     """The classes that a detector searches for one noun of a task.
 
     similarity: cosine of the noun's and the class's centred text features, None without a comparison. accepted: False
-    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known,
-    for a message: the ground truth's regions, or the classes nearest to a noun without one.
+    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known:
+    the ground truth's regions, or the classes near to a noun without one. min_score: from which a detection counts.
     """
 
     noun: str
@@ -49,6 +49,7 @@ class NounMatch:
     similarity: float | None = None
     accepted: bool = True
     known: tuple[str, ...] = ()
+    min_score: float | None = None
 
     @property
     def is_searched(self) -> bool:
@@ -59,8 +60,8 @@ class NounMatch:
     def warning(self) -> str | None:
         """Return why the noun cannot be found or may be a different thing; None if it is searched as itself."""
         if self.basis is MatchBasis.NONE:
-            nearest = f"; the nearest are {', '.join(map(repr, self.known))}" if self.known else ""
-            return f"no class of the detector matches {self.noun!r}{nearest}"
+            nearest = f" (near in meaning: {', '.join(map(repr, self.known))})" if self.known else ""
+            return f"no class of the detector matches {self.noun!r}{nearest}; point at it, or prompt a detector by text"
         if self.basis is MatchBasis.REGION and not self.classes:
             if not self.known:
                 return f"nothing searches {self.noun!r}: there is no detector"
@@ -88,8 +89,8 @@ class NounMatch:
 class NounReport:
     """A noun's match, and what has been detected of it so far.
 
-    detections: number of detections in all frames. best_score: the highest score, 0 without a detection. objects: the
-    number of confirmed objects. rival: the class that detections of this noun rather show, None without one.
+    detections: their number in all frames. best_score: the highest, in best_frame, below thresholds too; 0 and None
+    without any. objects: the number of confirmed ones. rival: the class that the detections rather show, or None.
     """
 
     match: NounMatch
@@ -97,11 +98,23 @@ class NounReport:
     best_score: float = 0.0
     objects: int = 0
     rival: str | None = None
+    best_frame: int | None = None
 
     def describe(self) -> str:
-        """Return one line for the operator."""
+        """Return one line for the operator: what was found, or why nothing was."""
+        if not self.match.is_searched:
+            return self.match.describe()
         found = f"{self.detections} detections, best score {self.best_score:.2f}, {self.objects} confirmed"
-        return f"{self.match.describe()}: {found}" if self.match.is_searched else self.match.describe()
+        return f"{self.match.describe()}: {found if self.detections or self.objects else self._unseen()}"
+
+    def _unseen(self) -> str:
+        if self.best_frame is None:
+            return "not seen so far; point at it if a frame shows it"
+        seen, least = f"seen in frame {self.best_frame} with {self.best_score:.2f}", self.match.min_score
+        if least is None or self.best_score >= least:
+            return f"{seen}, but too large, without depth, or enlarged only: a lower min-score may do, or point at it"
+        key = max(1, math.floor(80 * self.best_score)) / 100
+        return f"{seen} (threshold {least:.2f}): --set min-score={key:g}, or point at it"
 
 
 def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.objects import RECORD as OBJECTS
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
-from gausslite.fusion.refinement_views import RefineInput
+from gausslite.fusion.refinement import RefineInput
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.update_log import PutOutcome

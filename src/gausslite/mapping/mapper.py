@@ -32,7 +32,8 @@ from gausslite.mapping.free_space import contradicted_rows, has_guessed_depth, r
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.moving import MovingSettings, moving_pixels, without_pixels
 from gausslite.mapping.pose_corrector import LoopCounts, PoseCorrector
-from gausslite.mapping.poses import PoseTable, RefinementSettings, ViewRefiner
+from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
+from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
@@ -108,7 +109,7 @@ class GaussianMapper:
             settings.pose_prior, settings.keyframes.pose_updates_per_frame, settings.pose_anchor_share
         )
         self.poses = PoseTable()
-        self._refiner = ViewRefiner(refinement, self.render, self.poses)
+        self._refiner = open_refiner(refinement, self.render, self.poses)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
         self._corrector = corrector
         self._extent_m = 0.0
@@ -300,7 +301,8 @@ class GaussianMapper:
             **add_prefix("table", self._table.state()),
             **add_prefix("keyframes", self.store.state()),
             **add_prefix("trainer", self._trainer.state()),
-            **add_prefix("refiner", self._refiner.state()),
+            **add_prefix("refiner", {} if self._refiner is None else self._refiner.state()),
+            **add_prefix("refiner/history", self.poses.state()),
             **add_prefix("loops", {} if self._corrector is None else self._corrector.state()),
             **({} if self.poses.T_corrected_odometry is None else {_CORRECTED: self.poses.T_corrected_odometry}),
             "generator": generator_state(self._rng),
@@ -317,7 +319,9 @@ class GaussianMapper:
         self._table.restore(select_prefix(state, "table"))
         self.store.restore(select_prefix(state, "keyframes"), self._window_view)
         self._trainer.restore(select_prefix(state, "trainer"))
-        self._refiner.restore(select_prefix(state, "refiner"))
+        if self._refiner is not None:
+            self._refiner.restore(select_prefix(state, "refiner"))
+        self.poses.restore(select_prefix(state, "refiner/history"))
         if self._corrector is not None:
             self._corrector.restore(select_prefix(state, "loops"))
         if _CORRECTED in state:
@@ -344,14 +348,15 @@ class GaussianMapper:
         largest_depth_m = min(float(frame.depth_m.max()), self.settings.seeding.max_depth_m)
         self._extent_m = max(self._extent_m, largest_depth_m * _EXTENT_PER_DEPTH)
         anchor = self.store.next_anchor
-        if not self._refiner.enabled or self._table.count == 0:
+        if self._refiner is None or self._table.count == 0:
             return self._window_view(Keyframe(frame, relevance, anchor=anchor))
         return self._window_view(Keyframe(self._refiner.refine(frame), relevance, recorded=frame, anchor=anchor))
 
     def _refine_keyframes(self, scheduler: StageScheduler) -> None:
         """Refine the next keyframes against the map, while there is time and the prior allows an error."""
-        refines = self._refiner.enabled and self._table.count > 0
-        for keyframe in self._refiner.next_keyframes(self.store.window) if refines else ():
+        if self._refiner is None or self._table.count == 0:
+            return
+        for keyframe in self._refiner.next_keyframes(self.store.window):
             if not scheduler.has_time_for(Stage.KEYFRAME_REFINEMENT):
                 return
             with scheduler.timing(Stage.KEYFRAME_REFINEMENT):

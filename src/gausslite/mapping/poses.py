@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -12,7 +11,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame, FrameId
 from gausslite.domain.pose import (
@@ -22,17 +20,9 @@ from gausslite.domain.pose import (
     inverse,
     orthonormal,
     require_rigid,
-    transform_of,
 )
-from gausslite.domain.recording import PoseExposurePrior
-from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
-from gausslite.mapping.keyframes import Keyframe, WindowView
-from gausslite.pose_fit.exposure import fit_exposure
-from gausslite.pose_fit.photometric import fit_pose
-from gausslite.render.rasterizer import Rendering
+from gausslite.domain.state import State, get_array, get_counts, int_array
 
-_MAX_PIXELS = 4_000
-"""Pixels that a fit compares: an evaluation gains from more, a map that still grows does not."""
 _MAX_POSES = 20_000
 """Beyond this number, every second pose of the older half is removed: 5 MB."""
 _RECENT_POSES = 32
@@ -205,102 +195,3 @@ class PoseTable:
         corrections = [pose.correction for pose in self._poses.values()]
         total: Float64[ndarray, "6"] = np.sum(corrections or [np.zeros(6)], axis=0)
         return total
-
-
-RenderMap = Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]
-"""Renders the map from T_world_camera, with the camera's motion."""
-
-
-@dataclass(frozen=True, slots=True)
-class RefinementSettings:
-    """How views are refined.
-
-    prior: standard deviations of pose and exposure errors. keyframes_per_frame: keyframes refined with each frame.
-    anchor_share: share of the mission's mean correction by which each fit moves back; 0 if the poses do not come from
-    an odometry.
-    """
-
-    prior: PoseExposurePrior
-    keyframes_per_frame: int
-    anchor_share: float
-
-
-class ViewRefiner:
-    """Refines views under the prior. It owns the last pose correction and its place in the window.
-
-    Each frame is aligned to the map, and the map is trained on the aligned frames, so both could drift from the
-    odometry together. After each fit, the refined pose moves back by a share of the mission's mean correction.
-    """
-
-    def __init__(self, settings: RefinementSettings, render: RenderMap, poses: PoseTable) -> None:
-        self._prior = settings.prior
-        self._settings = settings
-        self._render = render
-        self._poses = poses
-        self._T_odometry_refined = np.eye(4)
-        self._position = 0
-
-    @property
-    def enabled(self) -> bool:
-        """False if poses and colours are used as recorded."""
-        return not self._prior.is_exact
-
-    def state(self) -> State:
-        """Return the pose table, the last pose correction and the position of the last refined keyframe."""
-        return {
-            "T_odometry_refined": self._T_odometry_refined,
-            "position": int_array(self._position),
-            **add_prefix("history", self._poses.state()),
-        }
-
-    def restore(self, state: State) -> None:
-        """Continue from another refiner's state. Raises MapFileError, PoseError."""
-        T_odometry_refined = get_array(state, "T_odometry_refined", (4, 4), np.float64)
-        require_rigid("state T_odometry_refined", T_odometry_refined)
-        self._T_odometry_refined = T_odometry_refined.copy()
-        [self._position] = get_counts(state, "position", 1)
-        self._poses.restore(select_prefix(state, "history"))
-
-    def refine(self, recorded: Frame) -> Frame:
-        """Return a new frame with refined pose and exposure. The search starts at the last frame's pose correction."""
-        initial = recorded.T_world_camera
-        if self._prior.has_pose_error:
-            initial = initial @ self._T_odometry_refined
-        frame = self._fit(recorded, initial)
-        self._T_odometry_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
-        return frame
-
-    def next_keyframes(self, window: Sequence[WindowView]) -> Iterator[Keyframe]:
-        """Yield the keyframes to refine with this frame, in rotation over the window.
-
-        The last one counts as refined when the next one is asked for.
-        """
-        refinable = [view.keyframe for view in window if view.keyframe.recorded is not None]
-        for _ in range(min(self._settings.keyframes_per_frame, len(refinable))):
-            position = (self._position + 1) % len(refinable)
-            yield refinable[position]
-            self._position = position
-
-    def refine_keyframe(self, keyframe: Keyframe) -> Keyframe:
-        """Return the keyframe with its pose and exposure refined against the current map."""
-        if keyframe.recorded is None:
-            return keyframe
-        return replace(keyframe, frame=self._fit(keyframe.recorded, keyframe.frame.T_world_camera))
-
-    def _fit(self, recorded: Frame, T_world_rendered: Float64[ndarray, "4 4"]) -> Frame:
-        rendering = self._render(recorded.camera, T_world_rendered, recorded.motion)
-        T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior, _MAX_PIXELS)
-        if self._prior.has_pose_error:
-            T_world_camera = self._anchored(recorded, T_world_camera)
-        exposure = fit_exposure(rendering, recorded, self._prior, _MAX_PIXELS)
-        return replace(recorded, rgb=exposure.to_map(recorded.rgb), T_world_camera=T_world_camera)
-
-    def _anchored(self, recorded: Frame, T_world_camera: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-        """Return the pose moved back by a share of the mean correction, and store it in the table."""
-        self._poses.refine(recorded.id, T_world_camera)
-        back = -self._settings.anchor_share * self._poses.mean_correction
-        anchored = T_world_camera.copy()
-        anchored[:3, :3] = transform_of(back)[:3, :3] @ T_world_camera[:3, :3]
-        anchored[:3, 3] += back[:3]
-        self._poses.refine(recorded.id, anchored)
-        return anchored

@@ -14,7 +14,7 @@ from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
-from gausslite.mapping.tracking import CameraTracker
+from gausslite.mapping.pose_estimation import CameraTracker, open_tracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.localisation_monitor import LocalisationMonitor
 from gausslite.mission.prior_map import PriorMap
@@ -36,8 +36,9 @@ from gausslite.render.rasterizer import Rasterizer
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
-OpenMonitor = Callable[[PriorMap | None], LocalisationMonitor]
-"""The plug-in of `gausslite.monitors`, for a mission that continues an earlier map, or begins its own."""
+OpenMonitor = Callable[[PriorMap | None, bool | None], LocalisationMonitor]
+"""The plug-in of `gausslite.monitors`, with the earlier map that the mission continues, if any, and whether live frames
+are compared with each other in the background; None: a recording's frames, which were compared before."""
 
 
 def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> GaussianMapper:
@@ -68,14 +69,23 @@ def open_corrector(settings: MissionSettings, rasterizer: Rasterizer) -> PoseCor
 
 
 def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTracker | None:
-    """Return a tracker against the mapper's map; None if frames are mapped with their own poses."""
-    return CameraTracker(mapper.render) if settings.poses is PoseMode.TRACK else None
+    """Return a tracker against the mapper's map; None if frames are mapped with their own poses.
+
+    Raises MissingPluginError.
+    """
+    return open_tracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
-def open_monitor(settings: MissionSettings, prior: PriorMap | None = None) -> LocalisationMonitor | None:
-    """Return what judges the place of each frame; None where the camera is tracked, or if none is installed."""
-    open_plugin: OpenMonitor | None = find(Group.MONITORS)
-    return None if open_plugin is None or settings.poses is PoseMode.TRACK else open_plugin(prior)
+def open_monitor(
+    settings: MissionSettings, prior: PriorMap | None = None, in_background: bool | None = None
+) -> LocalisationMonitor | None:
+    """Return what judges the place of each frame; None with `force`, where the camera is tracked, or without a plug-in.
+
+    in_background: see `OpenMonitor`.
+    """
+    is_needed = settings.poses is not PoseMode.TRACK and not settings.force
+    open_plugin: OpenMonitor | None = find(Group.MONITORS) if is_needed else None
+    return None if open_plugin is None else open_plugin(prior, in_background)
 
 
 def chosen_detector(perception: PerceptionSettings) -> Detector | None:
@@ -83,12 +93,13 @@ def chosen_detector(perception: PerceptionSettings) -> Detector | None:
     if perception.model is None:
         return None
     options = DetectorOptions(
-        perception.segmenter,
-        perception.vocabulary,
-        perception.threads,
-        perception.accept_similar,
-        perception.tiles,
-        perception.detection_time_s,
+        segmenter=perception.segmenter,
+        vocabulary=perception.vocabulary,
+        threads=perception.threads,
+        accept_similar=perception.accept_similar,
+        min_score=perception.min_score,
+        tiles_per_side=perception.tiles,
+        time_limit_s=perception.detection_time_s,
     )
     return open_detector(perception.model, options)
 
@@ -154,8 +165,7 @@ class EstimatorFactory:
         It uses the user's detector or, without any, the scene's ground truth. Raises InvalidInputError without both,
         unless a person points at all targets.
         """
-        accept_similar = self._perception.accept_similar
-        evidence = EvidenceSettings.accept_similar() if accept_similar else EvidenceSettings()
+        evidence = EvidenceSettings.accept_similar() if self._perception.accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         detector = self._detector_or_truth(bool(graph.queries))
         if self._detector is None or not self._perception.asynchronous:

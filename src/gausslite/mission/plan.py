@@ -131,7 +131,8 @@ class RunPlan:
     def task_mapper(self, scene: SceneInfo) -> TaskMapper:
         """Return a mapper for other frames. Raises InvalidInputError, ModelFileError, KernelError."""
         models = EstimatorFactory(self.perception, lambda: scene)
-        return build_task_mapper(self.mission, models, self.schedule.first or self.regions)
+        roi, monitor = self.schedule.first or self.regions, open_monitor(self.mission, in_background=False)
+        return build_task_mapper(self.mission, models, roi, monitor=monitor)
 
     def _stated(self, source: Source, saved: SavedRun | None) -> StatedValues:
         """Return what is not to be estimated: also what a saved run has, and what needs poses that are not used."""
@@ -186,13 +187,13 @@ class RunPlan:
         return graph.with_pointed(get_text(saved.extra, _POINTED).split("\n"))
 
     def _report_search(self, source: Source, models: EstimatorFactory) -> None:
-        """Report what is searched for each noun of the tasks."""
+        """Report what of the tasks is not understood, and what is searched for each noun."""
         graphs = self.schedule.graphs()
         if graphs and self.perception.model is None:
             report_region_file(self.source.spec, source)
         for graph in graphs:
-            for match in models.noun_matches(graph):
-                print_message(match.describe())
+            for line in (*graph.warnings, *(match.describe() for match in models.noun_matches(graph))):
+                print_message(line)
 
     def _localised(self, stream: FrameStream, prior: PriorMap | None) -> FrameStream:
         """Return the sequence in the world frame of the earlier map, if it is recognised there."""

@@ -192,8 +192,7 @@ class PerceptionSettings:
     """The models that find the task's nouns. Without a model file, the ground truth of the sequence is used.
 
     segmenter: how detected boxes become masks, "yolo" (the detector's masks), "depth" or a FastSAM file; None for the
-    model's own masks, or depth if it has none. Masks of frames between detections are cut by depth inside the
-    re-projected boxes, which on a real kitchen is as accurate as the segmenter at a third of the time.
+    model's own masks, or depth if it has none.
 
     asynchronous: mapping does not wait for detections; they run on their own thread and take effect when they are
     finished. detection_time_s: no further tile is started if it would end later than this; None for no limit.
@@ -223,6 +222,9 @@ class PerceptionSettings:
         metadata=FILE,
     )
     accept_similar: bool = option(False, "also map objects of a class that is only similar to the task's noun")
+    min_score: float | None = option(
+        None, "score from which a detection counts (default: 0.25)", low=0.01, high=0.99, needs="detector"
+    )
     tiles: int = option(
         2,
         "also detect in NxN enlarged parts of each keyframe, as time allows, to find small, distant objects; 1: off",
@@ -262,12 +264,7 @@ class MissionSettings:
     its time instead of a fixed number. pose_prior: tracked poses have TRACKED_PRIOR if it allows no pose error.
     """
 
-    policy: str = option(
-        TASK,
-        "how the map is seeded and trained",
-        metavar="NAME",
-        choices=tuple(sorted(POLICIES)),
-    )
+    policy: str = option(TASK, "how the map is seeded and trained", metavar="NAME", choices=tuple(sorted(POLICIES)))
     disabled: frozenset[str] = option(frozenset(), _DISABLE_HELP, key="disable", metavar="A,B")
     max_gaussians: int = option(DEFAULT_MAX_GAUSSIANS, "upper limit of the map's size", low=1)
     iterations: int | None = option(
@@ -316,6 +313,11 @@ class MissionSettings:
         LoopMode.AUTO,
         "a keyframe that sees an earlier place again corrects poses and map, unless poses are exact (extra: slam); "
         "auto: if the extra is installed",
+    )
+    force: bool = option(
+        False,
+        "map although poses or depth contradict the images (default: end or skip, with what would agree)",
+        metadata=MAY_CHANGE,
     )
 
     def __post_init__(self) -> None:

@@ -23,9 +23,9 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.pose_corrector import LoopCounts
+from gausslite.mapping.pose_estimation import CameraTracker
 from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.task_change import Reevaluation
-from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
@@ -124,8 +124,7 @@ class TaskMapper:
         self._sent_voxels = sent_voxels
         self._scheduler = scheduler or FrameScheduler()
         self._publish = publish
-        self._tracker = tracker
-        self._monitor = monitor
+        self._tracker, self._monitor = tracker, monitor
         self._detected: DetectedImage | None = None
         self._defects: dict[str, int] = {}
         self._last_image = LastImage()
@@ -267,8 +266,8 @@ class TaskMapper:
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.
 
-        A frame with a defect is skipped, one whose pose is not found by tracking, and one in which everything moves.
-        One waits whose place is not known; when it is, the frames that waited are mapped first.
+        A frame with a defect is skipped, one that the monitor refuses, one without a tracked pose, and one in which
+        everything moves. When the monitor has found the robot again, the frames that waited are mapped first.
         """
         self._scheduler.begin(waited_s)
         repeats = self._last_image.is_repeated_by(frame)
@@ -276,7 +275,7 @@ class TaskMapper:
             return self._skip_defect(frame, defect)
         admitted = Admission((frame,)) if self._monitor is None else self._monitor.admit(frame, self._mapper)
         if not admitted.frames:
-            return self._skip(frame, UNPLACED)
+            return self._skip(frame, admitted.reason)
         if admitted.T_map_odometry is not None:
             self._mapper.poses.T_corrected_odometry = admitted.T_map_odometry
         recovered = []
@@ -321,8 +320,8 @@ class TaskMapper:
         )
 
     def idle_step(self) -> bool:
-        """Run one iteration while no frame waits. Return False if nothing has been mapped yet."""
-        return self._mapper.idle_step()
+        """Run one iteration while no frame waits. Return False if nothing is mapped, or if the robot is not tracked."""
+        return self.localisation is LocalisationState.TRACKED and self._mapper.idle_step()
 
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""

@@ -56,8 +56,7 @@ class RegionDetector:
             for name in self._names(query):
                 if name not in masks:
                     masks[name] = self._regions[name].mask(frame)
-                box = bounding_box(masks[name])
-                if box is not None:
+                if (box := bounding_box(masks[name])) is not None:
                     found.append(Detection(query, 1.0, box, masks[name], is_exact=True))
         return found
 

@@ -26,6 +26,8 @@ class DetectorOptions:
     """None: as many as the runtime chooses."""
     accept_similar: bool = False
     """Also detect classes that are only similar to a noun."""
+    min_score: float | None = None
+    """From which a detection counts; None: the reader's own."""
     tiles_per_side: int = 1
     """Also detect in this many times as many enlarged parts of the image; 1: in the whole image alone."""
     time_limit_s: float | None = None
@@ -52,9 +54,8 @@ def open_detector(path: Path, options: DetectorOptions) -> Detector:
 
     Raises ModelFileError, InvalidInputError, KernelError, and MissingPluginError without the default reader.
     """
-    others = [reader for name, reader in installed(Group.DETECTORS) if name != DEFAULT]
-    for reader in others:
-        detector: Detector | None = reader.open(path, options)
+    for name, reader in installed(Group.DETECTORS):
+        detector: Detector | None = None if name == DEFAULT else reader.open(path, options)
         if detector is not None:
             return detector
     detector = load(Group.DETECTORS, purpose="--detector").open(path, options)

@@ -91,8 +91,7 @@ class Evidence:
 
     def needs_observation(self, landmark: Landmark) -> bool:
         """Return True if one more observation could confirm a candidate."""
-        is_candidate = self.state(landmark) is LandmarkState.CANDIDATE
-        return is_candidate and landmark.seen_count + 1 >= self.settings.min_seen
+        return self.state(landmark) is LandmarkState.CANDIDATE and landmark.seen_count + 1 >= self.settings.min_seen
 
 
 def _is_rather(other: Landmark, landmark: Landmark) -> bool:

@@ -65,6 +65,7 @@ class RelevanceTracker:
         self._frames_since = 0
         self._needs_observation = False
         self._known_targets: list[int] = []
+        self._seen: dict[str, tuple[int, float, int]] = {}  # detections of a noun, its best score, in which frame
 
     @property
     def known_objects(self) -> int:
@@ -91,14 +92,9 @@ class RelevanceTracker:
     def report(self, match: NounMatch) -> NounReport:
         """Return what has been detected of a noun so far."""
         landmarks = self._object_map.with_phrase(match.noun)
-        rivals = (self._evidence.rival(landmark) for landmark in landmarks)
-        return NounReport(
-            match,
-            detections=sum(landmark.seen_count for landmark in landmarks),
-            best_score=max((landmark.best_score for landmark in landmarks), default=0.0),
-            objects=len(self._evidence.confirmed(landmarks)),
-            rival=next((rival for rival in rivals if rival is not None), None),
-        )
+        detections, best_score, best_frame = self._seen.get(match.noun, (0, 0.0, None))
+        rival = next(filter(None, map(self._evidence.rival, landmarks)), None)
+        return NounReport(match, detections, best_score, len(self._evidence.confirmed(landmarks)), rival, best_frame)
 
     def state(self) -> State:
         """Return the landmarks and the keyframe's pose as named arrays."""
@@ -109,6 +105,9 @@ class RelevanceTracker:
             "known_targets": int_array(*self._known_targets),
         }
         state |= self._selector.state()
+        state["seen_nouns"] = encode_text("\n".join(self._seen))
+        state["seen_counts"] = int_array(*(number for n, _, i in self._seen.values() for number in (n, i)))
+        state["seen_scores"] = np.array([score for _, score, _ in self._seen.values()])
         state["excluded_m"] = self._targets.excluded_m
         state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
@@ -125,6 +124,9 @@ class RelevanceTracker:
             require_rigid("state T_world_keyframe", pose)
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
         self._targets.excluded_m = get_array(state, "excluded_m", (None, 3), np.float64).copy()
+        nouns = get_text(state, "seen_nouns").splitlines()
+        counts, scores = get_counts(state, "seen_counts", 2 * len(nouns)), get_floats(state, "seen_scores", len(nouns))
+        self._seen = dict(zip(nouns, zip(counts[::2], scores, counts[1::2], strict=True), strict=True))
         self._selector.restore(state)
         self._object_map.restore([decode_landmark(saved, self._selector.decode(saved)) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
@@ -227,6 +229,9 @@ class RelevanceTracker:
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
     ) -> list[tuple[Landmark, Bool[ndarray, "h w"]]]:
         """Add the detections to the object map; return the masks of its landmarks in this frame."""
+        for box in detections:
+            n, best, at = self._seen.get(box.phrase, (0, 0.0, frame.index))
+            self._seen[box.phrase] = (n + (not box.is_weak), *max((best, at), (box.score, frame.index)))
         excluded = self._excluded_pixels(detections, frame)
         kept = self._drop_excluded(self._drop_generic_anchors(detections), excluded)
         depth_m = np.where(excluded, np.float32(0.0), depth_m)
@@ -277,15 +282,10 @@ class RelevanceTracker:
         kept = []
         for detection in detections:
             left = detection.mask & ~excluded
-            is_other = np.count_nonzero(left) >= _MIN_LEFT_SHARE * np.count_nonzero(detection.mask)
+            is_other = np.count_nonzero(left) > _MIN_LEFT_SHARE * np.count_nonzero(detection.mask)
             if detection.phrase not in self._graph.excluded_nouns and is_other:
                 kept.append(replace(detection, mask=left))
         return kept
-
-
-def merge_detections(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
-    """Return the binary w(u, v) of detections whose phrases are targets."""
-    return merge_masks([(detection.phrase, detection.mask) for detection in detections], targets, frame)
 
 
 def merge_masks(

@@ -5,6 +5,7 @@ Clients are thread-safe. Streams are iterators; closing one cancels the call.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,6 +17,8 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits
+from gausslite.datasets.files import RgbdImage, resize_rgbd
+from gausslite.datasets.source import capped_size
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -41,6 +44,9 @@ _FOLLOW_INTERVAL_S, _UNREACHABLE_S = 5.0, 60.0
 """Shortest times until a client looks for the owner of its subsets again."""
 # larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
+
+_MAX_FRAME_BYTES, _MAX_SENT_PX = MAX_MESSAGE_BYTES - (1 << 12), round(0.99 * convert.MAX_IMAGE_PX)
+_log = logging.getLogger(__name__)
 
 FrameOutcome = agent_pb.FrameOutcome
 """Names the outcomes of `AgentClient.ingest`: `FrameOutcome.Name(result.outcome)`."""
@@ -115,11 +121,9 @@ class AgentClient(ServiceChannel):
         """Send frames; yields one outcome for each, in order.
 
         lens: distortion of the frames' images, which the agent corrects together with the rolling shutter that
-        `Frame.motion` states.
+        `Frame.motion` states. Frames of more pixels or bytes than a message holds are made smaller.
         """
-        requests = (
-            agent_pb.IngestFramesRequest(frame=convert.frame_to_message(frame, lossless, lens=lens)) for frame in frames
-        )
+        requests = (agent_pb.IngestFramesRequest(frame=_fitting_message(frame, lossless, lens)) for frame in frames)
         return self._exchange(self._stub.IngestFrames, requests)
 
     def end_mission(self, handover: bool | None = None, drain_s: float | None = None) -> agent_pb.EndMissionResponse:
@@ -154,6 +158,21 @@ class AgentClient(ServiceChannel):
             roi_only=roi_only,
         )
         yield from _decode_updates(self._stream(self._stub.WatchMap, request))
+
+
+def _fitting_message(frame: Frame, lossless: bool, lens: Lens | None) -> geometry_pb2.EncodedFrame:
+    """Return the frame's message, of a smaller image if it exceeds what the agent accepts."""
+    recorded, pixels = RgbdImage(frame.rgb, frame.depth_m, frame.camera), _MAX_SENT_PX
+    while True:
+        image = resize_rgbd(recorded, capped_size(frame.camera, pixels))
+        message = convert.frame_to_message(image.in_frame(frame), lossless, lens=lens)
+        if message.ByteSize() < _MAX_FRAME_BYTES:
+            break
+        pixels = image.depth_m.size // 2
+    if image.camera != frame.camera:
+        size = f"{image.camera.width_px}x{image.camera.height_px}"
+        _log.warning("frame %d: the image is made smaller, to %s, so that a message holds it", frame.index, size)
+    return message
 
 
 def is_done(status: agent_pb.GetAgentStatusResponse) -> bool:

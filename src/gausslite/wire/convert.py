@@ -16,7 +16,7 @@ from numpy import ndarray
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import CodecError, InvalidInputError
-from gausslite.domain.frame import Frame, has_whole_chunks, image_size
+from gausslite.domain.frame import MAX_DEPTH_M, Frame, has_whole_chunks, image_size, is_too_far
 from gausslite.domain.pose import Twist, require_rigid
 from gausslite.domain.relevance import PointM
 from gausslite.domain.voxel_changes import TileDigests
@@ -110,7 +110,6 @@ KEYFRAME_JPEG_QUALITY = 85
 KEYFRAME_PNG_COMPRESSION = 6
 """Keyframes are sent once, and compete for a robot's bandwidth."""
 _MM_PER_M = 1000.0
-_MAX_DEPTH_MM = 65535
 
 
 def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False, quality: int = JPEG_QUALITY) -> bytes:
@@ -124,11 +123,11 @@ def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False, quality:
 
 
 def encode_depth(depth_m: Float32[ndarray, "h w"], compression: int = PNG_COMPRESSION) -> bytes:
-    """Encode as 16-bit PNG in millimetres; depth beyond 65.5 m becomes 0 (no return)."""
+    """Encode as 16-bit PNG in millimetres; depth beyond 65.5 m becomes 0 (no return), unless nearly all lies there."""
     import cv2
 
     depth_mm = np.rint(depth_m.astype(np.float64) * _MM_PER_M)
-    depth_mm[depth_mm > _MAX_DEPTH_MM] = 0
+    depth_mm[depth_mm > _MM_PER_M * MAX_DEPTH_M] = _MM_PER_M * MAX_DEPTH_M if is_too_far(depth_m) else 0
     options = [cv2.IMWRITE_PNG_COMPRESSION, compression]
     return bytes(cv2.imencode(".png", depth_mm.astype(np.uint16), options)[1].tobytes())
 

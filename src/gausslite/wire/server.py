@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import logging
 import os
-import signal
 import socket
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -24,6 +23,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
+from gausslite.process import handled_signals
 from gausslite.wire import security
 from gausslite.wire.channel import KEEPALIVE_S, UNIX, connection_options, host_and_port
 from gausslite.wire.status import code_and_reason, to_status
@@ -192,13 +192,13 @@ async def serve_until_stopped(
     limits: security.CallLimits | None = None,
     health_listen: str | None = None,
 ) -> None:
-    """Serve until SIGTERM or SIGINT, or until the background task ends; then drain the server. Logs the addresses.
+    """Serve until a signal, or until the background task ends; then drain the server. Logs the addresses.
 
     Raises the errors of the background task, also those raised during its cancellation.
     """
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in handled_signals():
         loop.add_signal_handler(number, stopping.set)
     running = await start_server(listen, services, tls, limits, health_listen)
     service_names = ", ".join(service.name for service in services)

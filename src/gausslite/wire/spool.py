@@ -192,7 +192,7 @@ class Spool:
         self._begin_head()
 
     def _begin_head(self) -> None:
-        """Compare the commits with those of the head; it goes on from here."""
+        """Warn if the head knows more commits than the file; from then on the head follows the file."""
         last, self._commits = self._head.read(), int(self._property("commits") or 0)
         is_lost = last is None and self._commits > 0 and not self.is_new
         if is_lost or (last is not None and (last[0] != self.token or last[1] > self._commits)):

@@ -20,6 +20,7 @@ from gausslite_bench.fuzz.run import FuzzSettings, run_fuzz
 from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, run_gpu, run_raster
 from gausslite_bench.report import Report
 from gausslite_bench.server.bench import ServerBenchSettings, run_server
+from gausslite_bench.team.frame_attacks import FrameAttackSettings, run_frame_attacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,10 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
     "chaos": (
         _Measurement(ChaosSettings, run_chaos),
         "a fusion server and its agents under kills, partitions and a full disk",
+    ),
+    "frames": (
+        _Measurement(FrameAttackSettings, run_frame_attacks),
+        "whom robots in wrong frames harm in a team",
     ),
     "fuzz": (_Measurement(FuzzSettings, run_fuzz), "mutated messages for the codec and every method of the services"),
 }

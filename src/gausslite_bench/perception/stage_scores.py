@@ -18,7 +18,7 @@ from gausslite.domain.relevance import MIN_ROI_PIXELS, Detection, Region, Releva
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.detector import Detector
 from gausslite.perception.relevance import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import merge_detections
+from gausslite.perception.relevance_tracker import merge_masks
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 
 _MIN_FOUND_SHARE = 0.25
@@ -139,7 +139,11 @@ class _TaskEvaluation:
         nouns = [noun_of(target) for target in graph.targets]
         every = self._detector.detect(frame, graph.queries)
         detections = [detection for detection in every if detection.phrase in nouns and not detection.is_weak]
-        masks = {PerceptionStage.DETECTED: merge_detections(detections, nouns, frame).roi}
+        masks = {
+            PerceptionStage.DETECTED: merge_masks(
+                [(found.phrase, found.mask) for found in detections], nouns, frame
+            ).roi
+        }
         relevance = {stage: estimator.estimate(frame).relevance for stage, estimator in self._estimators.items()}
         masks |= {stage: stage_relevance.roi for stage, stage_relevance in relevance.items()}
         objects = {name: truths[name] & (frame.depth_m > 0) for name in self._query.objects}

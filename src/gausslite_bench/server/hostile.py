@@ -43,7 +43,7 @@ from gausslite_language.rules import RuleParser
 GOOD_AGENTS = 4
 _SEQ = 1 << 20
 _SAMPLE_S = 0.2
-_STORM_THREADS = 8
+_FLOOD_THREADS = 8
 _HELD_VOXELS = 400_000
 _TOKEN = "bad"  # noqa: S105 - of the attackers
 _NOUN = "mug"
@@ -90,11 +90,11 @@ def _resend(address: str, count: int, make: Callable[[str], bytes]) -> None:
     asyncio.run(run())
 
 
-def _storm(
+def _flood(
     address: str,
     call: Callable[[Any, int], object],
     connect: Callable[[str, float], ServiceChannel] = FusionClient,
-    callers: int = _STORM_THREADS,
+    callers: int = _FLOOD_THREADS,
 ) -> None:
     """Call from several threads, each again as soon as it is answered, whatever the answer."""
 
@@ -116,17 +116,17 @@ def _voxels(name: str, voxels: int) -> bytes:
     return encode_subset(RoiSubset(name, "", _SEQ, _SEQ, voxels_batch(range(voxels), 7)), GRID)
 
 
-def _storm_of_queries(address: str) -> None:
+def _flood_of_queries(address: str) -> None:
     report = object_report(RuleParser().parse(f"Pick up the {_NOUN}"), _NOUN, 200, 1)
     with FusionClient(address, deadline_s=60.0) as client:
         for _, session_id in _join(address, 48):
             client.report_objects(session_id, report)
-    _storm(address, lambda client, _: client.query_objects(_NOUN))
+    _flood(address, lambda client, _: client.query_objects(_NOUN))
 
 
-def _storm_of_views(address: str, callers: int, connect: Callable[[str, float], ServiceChannel] = FusionClient) -> None:
+def _flood_of_views(address: str, callers: int, connect: Callable[[str, float], ServiceChannel] = FusionClient) -> None:
     frame = keyframe(0, 1920, 1080)
-    _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
+    _flood(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
 
 
 async def _send(address: str, session_id: str, messages: Iterable[bytes]) -> None:
@@ -153,12 +153,12 @@ def _new_maps(address: str) -> None:
         session_id = client.join("bad-0", GRID, fresh_map=True).session_id
         asyncio.run(_send(address, session_id, [_voxels("bad-0", 50)]))
 
-    _storm(address, begin, _client, callers=1)
+    _flood(address, begin, _client, callers=1)
 
 
-def _storm_of_digests(address: str) -> None:
+def _flood_of_digests(address: str) -> None:
     session_id = _hold_map(address)
-    _storm(address, lambda client, _: client.stored_digests(session_id), callers=16)
+    _flood(address, lambda client, _: client.stored_digests(session_id), callers=16)
 
 
 def _new_snapshot(client: FusionClient, number: int) -> None:
@@ -178,13 +178,13 @@ def _large_keyframes(address: str) -> None:
     frame = keyframe(0, 1920, 1080)
     frame.rgb[:] = noise
     image = frame_to_message(frame, lossless=True)
-    sessions = [session_id for _, session_id in _join(address, _STORM_THREADS)]
+    sessions = [session_id for _, session_id in _join(address, _FLOOD_THREADS)]
 
     def send(client: FusionClient, number: int) -> None:
         image.index = number
         client.contribute_encoded_keyframes(sessions[number % len(sessions)], [image])
 
-    _storm(address, send)
+    _flood(address, send)
 
 
 def _slow_readers(address: str) -> None:
@@ -233,24 +233,24 @@ ATTACKS: Mapping[str, Attack] = {
         "a stream of messages of 200 000 tombstones",
         lambda to: _resend(to, 1, lambda name: tombstone_message(name, 200_000, _SEQ)),
     ),
-    "names": Attack("8 that join under new names", lambda to: _storm(to, lambda c, n: c.join(f"name-{n}", GRID))),
-    "queries": Attack("8 that query 48 x 200 objects", _storm_of_queries),
-    "render": Attack("60 that render 1920 x 1080", lambda to: _storm_of_views(to, 60)),
+    "names": Attack("8 that join under new names", lambda to: _flood(to, lambda c, n: c.join(f"name-{n}", GRID))),
+    "queries": Attack("8 that query 48 x 200 objects", _flood_of_queries),
+    "render": Attack("60 that render 1920 x 1080", lambda to: _flood_of_views(to, 60)),
     "watchers": Attack(
-        "50 that watch the map anew, each without another name", lambda to: _storm(to, _new_snapshot, callers=50)
+        "50 that watch the map anew, each without another name", lambda to: _flood(to, _new_snapshot, callers=50)
     ),
     "fresh-map": Attack("one that holds 400 000 voxels and begins new maps of 50", _new_maps),
-    "digests": Attack("16 that ask for the digests of 400 000 voxels", _storm_of_digests),
+    "digests": Attack("16 that ask for the digests of 400 000 voxels", _flood_of_digests),
     "keyframes": Attack("8 that send keyframes of 1920 x 1080, noise as PNG", _large_keyframes),
     "slow-readers": Attack("64 watchers that read one block", _slow_readers),
     "half-open": Attack("300 silent connections, 384 silent streams", _half_open),
     "parser": Attack(
         "48 that parse 1000 characters",
-        lambda to: _storm(to, lambda client, _: client.parse(_LONG_TASK), ParserClient, 48),
+        lambda to: _flood(to, lambda client, _: client.parse(_LONG_TASK), ParserClient, 48),
         "ParserService",
     ),
     "busy-parser": Attack("the control of parser", _compute, "ParserService"),
-    "agent-render": Attack("8 that render 1920 x 1080", lambda to: _storm_of_views(to, 8, AgentClient), "AgentService"),
+    "agent-render": Attack("8 that render 1920 x 1080", lambda to: _flood_of_views(to, 8, AgentClient), "AgentService"),
     "busy-agent": Attack("the control of agent-render", _compute, "AgentService"),
 }
 

@@ -1,11 +1,10 @@
 """Attack the frames of a team with made maps of one room: who is harmed, how far the fused map is off, what stays.
 
-`python -m gausslite_bench.team.frame_attacks [RUNS [ATTACK ...]]` prints the table; a seed always gives the same.
+A seed always gives the same.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import cache
 
@@ -13,6 +12,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.cli.progress import progress_bar
+from gausslite.config.option import option
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of, transform_points
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_keys
@@ -22,6 +24,7 @@ from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.render.rasterizer import MEAN, RGB
 from gausslite_bench.raster.procedural_room import SEED_VIEWS, seed_rows
+from gausslite_bench.report import Report
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.surface_registration import Surface
 
@@ -142,23 +145,43 @@ def run_attack(attack: str, seed: int) -> FrameAttack:
     return FrameAttack((before[0], _harmed(engine, good)), (before[1], _near(engine)), released, tuple(messages))
 
 
-def main(runs: int, attacks: list[str]) -> None:
-    """Print the table, with the worst and the mean run of each attack."""
-    print(
-        "| attack | runs | good robots harmed at the end, after evict | within 10 cm at the end (worst, mean) | "
-        "after evict (worst) | released |"
-    )
-    print("|---|---|---|---|---|---|", flush=True)
-    for attack in attacks:
-        found = [run_attack(attack, seed) for seed in range(runs)]
-        harmed, after = (sum(result.harmed[i] for result in found) for i in (0, 1))
-        near, near_after = ([100 * result.near[i] for result in found] for i in (0, 1))
-        print(
-            f"| {attack} | {runs} | {harmed}, {after} of {runs * ATTACKS[attack][1]} | {min(near):.0f}, "
-            f"{np.mean(near):.0f} % | {min(near_after):.0f} % | {sum(result.released > 0 for result in found)} runs |",
-            flush=True,
-        )
+@dataclass(frozen=True, slots=True)
+class FrameAttackSettings:
+    """The options of `bench frames`."""
+
+    runs: int = option(20, "runs of each attack, with the seeds 0, 1 and so on", low=1)
+    attacks: tuple[str, ...] = option(tuple(ATTACKS), f"among {', '.join(ATTACKS)}", metavar="A,B")
+
+    def __post_init__(self) -> None:
+        if unknown := {*self.attacks} - {*ATTACKS}:
+            raise InvalidInputError(f"--attacks: expected some of {', '.join(ATTACKS)}, got {min(unknown)!r}")
 
 
-if __name__ == "__main__":
-    main(int((sys.argv[1:] or ["20"])[0]), sys.argv[2:] or [*ATTACKS])
+def run_frame_attacks(settings: FrameAttackSettings) -> Report:
+    """Run the attacks; the report is good if no good robot is harmed, and no bad one is used again.
+
+    near: share of the fused map within 10 cm of the room, in the worst run and in the mean.
+    """
+    rows = []
+    with progress_bar(len(settings.attacks) * settings.runs, "frames", "run") as progress:
+        for attack in settings.attacks:
+            found = []
+            for seed in range(settings.runs):
+                found.append(run_attack(attack, seed))
+                progress.update()
+            harmed, harmed_after = (sum(result.harmed[i] for result in found) for i in (0, 1))
+            near, near_after = ([result.near[i] for result in found] for i in (0, 1))
+            rows.append(
+                {
+                    "attack": attack,
+                    "good_robots": settings.runs * ATTACKS[attack][1],
+                    "harmed": harmed,
+                    "harmed_after_evict": harmed_after,
+                    "near_worst": min(near),
+                    "near_mean": float(np.mean(near)),
+                    "near_worst_after_evict": min(near_after),
+                    "runs_with_release": sum(result.released > 0 for result in found),
+                }
+            )
+    faults = ("harmed", "harmed_after_evict", "runs_with_release")
+    return Report({"attacks": rows}, is_good=not any(row[fault] for row in rows for fault in faults))

@@ -10,7 +10,6 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion.keyframe_pool import AgentKeyframe
-from gausslite.mapping.keyframe_selection import KeyframeSelection
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import build_mapper
@@ -24,6 +23,7 @@ from gausslite.wire.update_sender import UplinkSettings
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.quality.trials import message_bytes
 from gausslite_bench.team.scenes import AgentScene
+from gausslite_refinement.keyframe_selection import KeyframeSelection
 
 _ROUND_FRAMES = 4
 _SUBSET_BYTES = 1 << 20

@@ -12,8 +12,18 @@ from enum import StrEnum
 from typing import Any, Final, NoReturn, Protocol, runtime_checkable
 
 from gausslite.domain.errors import LanguageModelError, TaskError
-from gausslite.domain.task import LIMITS, Predicate, Relation, TargetRole, TaskGraph, TaskParser, require_task_text
+from gausslite.domain.task import (
+    LIMITS,
+    Predicate,
+    Relation,
+    TargetRole,
+    TaskGraph,
+    TaskParser,
+    noun_of,
+    require_task_text,
+)
 from gausslite_language.grounding import ParsedPhrases, grounded_graph
+from gausslite_language.rules import RuleParser, lost_warning
 
 MAX_ANSWER_BYTES = 64 * 1024
 
@@ -267,6 +277,37 @@ class LanguageParser:
         """Return the model's graph, without nouns that the sentence does not mention."""
         require_task_text(text)
         return parse_answer(text, self._model.complete(messages_for(text)))
+
+
+class AddingParser:
+    """A TaskParser by rules, which queries a model only for nouns that the rules' graph lacks.
+
+    The rules' graph stands; a warning marks each target that the model adds. `parse` also raises LanguageModelError.
+    """
+
+    def __init__(self, parser: LanguageParser, rules: RuleParser) -> None:
+        self._parser, self._rules = parser, rules
+
+    def parse(self, text: str) -> TaskGraph:
+        """Return the graph of one task. Raises TaskError."""
+        graph, lost = self._rules.parse_counting(text)
+        return _with_lost_targets(graph, lost, self._parser.parse(text)) if lost else graph
+
+
+def _with_lost_targets(graph: TaskGraph, lost: Sequence[str], answer: TaskGraph) -> TaskGraph:
+    """Return the graph with the targets of an answer whose nouns it has lost, with their colours and superlatives."""
+    heads = {name: noun_of(name).split()[-1] for name in answer.targets}
+    roles = dict(zip(answer.targets, answer.roles, strict=True))
+    added = [name for name, head in heads.items() if head in lost][: LIMITS.max_targets - len(graph.targets)]
+    solved = {lost_warning(heads[name]) for name in added}
+    marks = (f"{name!r} was added by the language model" for name in added)
+    return replace(
+        graph,
+        targets=(*graph.targets, *added),
+        roles=(*graph.roles, *(roles[name] for name in added)),
+        attributes=(*graph.attributes, *(attribute for attribute in answer.attributes if attribute.name in added)),
+        warnings=(*(warning for warning in graph.warnings if warning not in solved), *marks)[: LIMITS.max_warnings],
+    )
 
 
 class CachedParser:

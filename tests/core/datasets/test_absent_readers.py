@@ -23,11 +23,14 @@ ABSENT = "needs the package gausslite_calibration, which is not installed"
 
 
 def test_folders_open_without_the_packages_of_other_readers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tum, seven = write_tum(tmp_path / "fr1"), write_seven_scenes(tmp_path / "parent" / "seq")
+    tum, inside = write_tum(tmp_path / "fr1"), write_tum(tmp_path / "parent" / "fr1_seq")
+    seven = write_seven_scenes(tmp_path / "seven")
     for package in READERS:
         remove_package(monkeypatch, package)
     assert open_source(str(tum)).name == "fr1"
-    assert open_source(str(seven.parent)).name == "seq"
+    assert open_source(str(inside.parent)).name == "fr1_seq"
+    with pytest.raises(DatasetError, match="sevenscenes: needs the package gausslite_recorders"):
+        open_source(str(seven))
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,9 @@ def test_the_published_camera_is_used_rather_than_a_file_above(tmp_path: Path) -
     write_json(tmp_path / "cam_params.json")
     source = open_source(str(folder))
     assert source.camera.fx_px == pytest.approx(517.3 * WIDTH / 640)
-    assert source.notes == ("the published camera of fr1 is scaled from 640x480 to 16x12",)
+    assert source.notes == (
+        "the camera is the published one of fr1, by the folder's name, scaled from 640x480 to 16x12",
+    )
     assert source.lens is not None
 
 

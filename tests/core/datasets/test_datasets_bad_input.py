@@ -111,14 +111,21 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
         "tum",
         lambda f: (f / "rgb/1.png").write_text("version https://git-lfs.github.com/spec/v1"),
         DatasetError,
-        "1.png: .* which begins with b'version https://'",
+        "1.png: .* got a Git LFS pointer",
     ),
     (
         "tum",
         lambda f: (f / "rgb.txt").write_bytes(gzip.compress(b"1 a")),
         DatasetError,
-        "rgb.txt: .* gzip compressed; unpack it",
+        "rgb.txt: .* got a gzip archive; unpack it first",
     ),
+    (
+        "tum",
+        lambda f: (f / "groundtruth.txt").write_text("1305031453,5 0,1 0 0 0 0 0 1\n"),
+        DatasetError,
+        "groundtruth.txt line 1: expected a point as the decimal mark, got the decimal comma of '1305031453,5'",
+    ),
+    ("tum", lambda f: (f / "rgb.txt").write_text("10,5 rgb/0.png\n"), DatasetError, "rgb.txt line 1: .* decimal comma"),
     ("seven", lambda f: cut(f / "frame-000004.color.png"), DatasetError, "frame-000004.color.png: expected a whole"),
     ("seven", lambda f: (f / "frame-000004.depth.png").unlink(), DatasetError, "000004.depth.png: expected an image"),
     ("seven", lambda f: write_colour(f / "frame-000004.depth.png"), DatasetError, "expected a 16-bit image"),
@@ -216,7 +223,7 @@ def test_a_place_without_a_sequence_is_named(tmp_path: Path, make: Damage, messa
 
 def test_a_compressed_recording_is_named(tmp_path: Path) -> None:
     (tmp_path / "desk.tar.gz").write_bytes(gzip.compress(b""))
-    with pytest.raises(DatasetError, match=r"desk.tar.gz: .* got a compressed file; unpack it first"):
+    with pytest.raises(DatasetError, match=r"desk.tar.gz: .* got a gzip archive; unpack it first"):
         open_source(str(tmp_path / "desk.tar.gz"))
 
 
@@ -263,7 +270,7 @@ def test_lost_tracking_is_a_gap_in_the_trajectory(tmp_path: Path, numbers: str) 
     assert len(times) == 25
     assert not any(10.31 < time < 10.49 for time in times)
     assert source.excluded_frames == (
-        "5 of 30 colour images are skipped: without a pose at their time or depth within 20 ms"
+        "5 of 30 colour images are skipped: without poses around them at most 1 s apart, or depth within 20 ms"
     )
 
 

@@ -19,11 +19,11 @@ from gausslite.domain.relevance import BallRegion, VoxelRegion
 
 
 def test_tum_uses_sparse_poses_only_at_their_own_images(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / "fr1", frames=7)
-    # poses 0.2 s apart: at the first image, just before the last, and at no image
-    (folder / "groundtruth.txt").write_text("10.0 1 0 0 0 0 0 1\n10.194 2 0 0 0 0 0 1\n10.4 3 0 0 0 0 0 1\n")
+    folder = write_tum(tmp_path / "fr1", frames=37)
+    # poses more than 1 s apart: at the first image, just before the last, and at no image
+    (folder / "groundtruth.txt").write_text("10.0 1 0 0 0 0 0 1\n11.194 2 0 0 0 0 0 1\n12.4 3 0 0 0 0 0 1\n")
     source = open_source(str(folder))
-    assert source.indices() == [0, 6]
+    assert source.indices() == [0, 36]
     assert [source.frame(i).T_world_camera[0, 3] for i in range(2)] == [1.0, 2.0]
 
 

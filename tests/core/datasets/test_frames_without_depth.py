@@ -58,5 +58,5 @@ def test_the_summary_reports_objects_not_found(tmp_path: Path, capsys: pytest.Ca
     output = capsys.readouterr().out
     assert "\n  no region matches 'unicorn'; the regions are " in output
     *_, note, outcome = output.splitlines()
-    assert note == "  none of these frames shows an object of the task"
+    assert note == "  found nothing of the task in these frames"
     assert outcome.startswith("found: no unicorn; 1 training view: ")

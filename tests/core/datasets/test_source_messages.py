@@ -81,7 +81,8 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
     (folder / "depth.txt").write_text("\n".join(rows[:3]))
     open_recorded(str(folder), None)
     _camera, line = capsys.readouterr().err.splitlines()
-    assert line == (f"{folder}: 1 of 4 colour images are skipped: without a pose at their time or depth within 20 ms")
+    reason = "without poses around them at most 1 s apart, or depth within 20 ms"
+    assert line == f"{folder}: 1 of 4 colour images are skipped: {reason}"
 
 
 def test_regions_of_the_folder_are_used_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from signals import hangup
 from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes
 
 from gausslite.cli import map_command
 from gausslite.cli.main import main
 from gausslite.codec.state_file import read_state
-from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
 from gausslite.mapping.poses import PoseTable
 from gausslite.mission.runner import FrameStream, OnCorrupt
 from gausslite.process import DeferredInterrupt
+from gausslite_recorders.sevenscenes import SevenScenesSource
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
@@ -29,7 +30,9 @@ def mapped(sequence: Path, out: Path, *more: str) -> int:
     return main(["map", str(sequence), *WITHOUT_ESTIMATES, *region, "--out", str(out), *more])
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 143, marks=hangup)]
+)
 def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
     number: signal.Signals,
     code: int,
@@ -78,11 +81,15 @@ def test_a_signal_while_results_are_written_loses_none_of_them(
     assert names[0] == names[1]
 
 
-def test_a_second_ctrl_c_interrupts_at_once() -> None:
+def test_a_second_ctrl_c_interrupts_at_once_unless_a_launcher_repeats_it(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.getsignal(signal.SIGINT)
     with DeferredInterrupt() as interrupt:
-        signal.raise_signal(signal.SIGINT)
-        assert interrupt.pending_exception
+        # launchers send it to the whole group, then SIGTERM after some seconds
+        for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.raise_signal(number)
+        assert type(interrupt.pending_exception) is KeyboardInterrupt
+        monkeypatch.setattr("gausslite.process._IMPATIENCE_S", -1.0)
+        signal.raise_signal(signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before

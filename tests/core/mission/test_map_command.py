@@ -103,7 +103,8 @@ def test_a_sequence_of_corrupt_frames_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("scale", "code", "message"),
     [
-        (1, 2, "expected surfaces in reach, got none in 6 frames with a median depth of"),
+        (1, 2, "expected frames with depth, got none in 6: in 6 depth lies beyond 65.5 m"),
+        (40, 2, "expected surfaces in reach, got none in 6 frames with a median depth of"),
         (1e6, 0, "the median depth is"),
     ],
 )

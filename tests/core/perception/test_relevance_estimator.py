@@ -20,6 +20,7 @@ from gausslite.perception.object_map import Observation
 from gausslite.perception.relevance import RegionRelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite_detectors.class_match import match_noun
+from gausslite_detectors.class_names import COCO_NAMES
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 
@@ -281,7 +282,12 @@ def test_a_noun_without_a_class_is_refused_with_the_nearest_names(noun):
     assert not match.is_searched
     assert (match.basis, match.classes) == (MatchBasis.NONE, ())
     assert f"no class of the detector matches {noun!r}" in match.warning
-    assert (noun != "shoe") or "the nearest are 'Sandal'" in match.warning
+    assert (noun != "shoe") or "(near in meaning: 'Sandal'); point at it, or" in match.warning
+
+
+def test_only_classes_near_in_meaning_are_offered():
+    near = {noun: match_noun(noun, COCO_NAMES, None).known for noun in ("fire extinguisher", "lamp", "dishwasher")}
+    assert near == {"fire extinguisher": (), "lamp": (), "dishwasher": ("refrigerator", "microwave", "oven")}
 
 
 @pytest.mark.parametrize("settings", [{"up_axis": (0.0, 0.0, 0.0)}, {"max_frames": 0}, {"max_rotation_deg": -1.0}])

@@ -18,7 +18,7 @@ from gausslite.codec.json import graph_as_json, graph_from_json
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
-from gausslite.domain.frame import Frame, image_size
+from gausslite.domain.frame import Frame, image_size, is_too_far
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import Twist, require_rigid
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TargetRole, TaskGraph
@@ -30,6 +30,15 @@ from gausslite.wire.clients import is_done
 from gausslite.wire.convert import decode_colour, encode_colour, encode_depth
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
+
+
+def test_depth_that_all_lies_beyond_the_range_stays_too_far() -> None:
+    metres = np.full((4, 4), 3.0, np.float32)
+    metres[0, 0] = 70.0
+    assert convert.decode_depth(encode_depth(metres), 4, 4)[0].tolist() == [0.0, 3.0, 3.0, 3.0]
+    assert is_too_far(convert.decode_depth(encode_depth(metres * 1000), 4, 4))
+
+
 GRAPH = TaskGraph(
     "id", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),), ("odd",)
 )

@@ -175,6 +175,16 @@ def test_waiting_frames_are_dropped_at_shutdown() -> None:
         worker.run(lambda mapper: mapper.count)
 
 
+def test_a_frame_larger_than_a_message_is_made_smaller_and_the_stream_continues() -> None:
+    size = (3840, 2880)
+    noise = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
+    images = {"rgb": noise, "depth_m": np.full(size[::-1], 2.0, np.float32), "camera": CAMERA.resized(*size)}
+    with agent() as a:
+        a.client.assign_task(TASK)
+        outcomes = list(a.client.ingest([frame(0, CAMERA), replace(frame(1, CAMERA), **images), frame(2, CAMERA)]))
+    assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 3, [each.reason for each in outcomes]
+
+
 def test_an_invalid_frame_is_rejected_and_the_stream_continues() -> None:
     opened = threading.Event()
     opened.set()

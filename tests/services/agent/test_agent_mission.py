@@ -17,6 +17,8 @@ import grpc
 import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server
+from plugin_entries import register
+from signals import hangup
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
@@ -33,6 +35,7 @@ from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings
 from gausslite.perception.relevance import RegionRelevanceEstimator
+from gausslite.plugins import Group
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
 from gausslite.wire.clients import AgentClient, FusionClient
@@ -41,7 +44,7 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.keyframe_upload import KeyframeUpload
+from gausslite_agent.keyframe_upload import open_upload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import AgentSettings, parse_arguments
@@ -103,7 +106,7 @@ def agent_mission(options: AgentSettings, address: str | None = None) -> Iterato
     link = options.link
     keyframes = None
     if uplink is not None:
-        keyframes = KeyframeUpload(uplink, GRID, link.keyframes, link.keyframes_during_mission)
+        keyframes = open_upload(uplink, GRID, link.keyframes, link.keyframes_during_mission)
     worker = MappingWorker(
         options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink, keyframe_upload=keyframes
     )
@@ -182,6 +185,18 @@ def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
         assert mission.state == MissionState.ENDED
     assert json.loads((tmp_path / "report.json").read_text())["frames"] < 10_000
     assert len(read_ply(tmp_path / "map.ply")) > 0
+
+
+def test_without_a_plug_in_that_selects_keyframes_none_are_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register(monkeypatch, Group.KEYFRAME_SELECTIONS)
+    options = settings(tmp_path, "--set", "handover=true", "--fusion", "localhost:1")
+    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
+        mission.run(stream_of(Wall(), options))
+        [agent] = fusion.client.status().agents
+    assert agent.handover_bytes > 0
+    assert agent.keyframes == 0
 
 
 def test_a_request_ends_a_replay_with_its_handover(tmp_path: Path) -> None:
@@ -281,7 +296,8 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
         assert p.wait(30) == 0
 
 
-def test_received_frames_give_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=hangup)])
+def test_received_frames_give_a_map_and_a_report_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
     address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
     command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--set", "threads=1"]
@@ -292,7 +308,7 @@ def test_received_frames_give_a_map_and_a_report_on_sigterm(tmp_path: Path) -> N
         with AgentClient(address) as client:
             client.assign_task("Pick up the cup")
             outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
-        p.send_signal(signal.SIGTERM)
+        p.send_signal(number)
         stderr_text = p.stderr.read()
         assert p.wait(30) == 0, stderr_text
     report = json.loads((out / "report.json").read_text())

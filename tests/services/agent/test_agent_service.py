@@ -60,10 +60,11 @@ def test_a_task_is_text_or_a_graph() -> None:
 def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
     mug = RegionDetector({"mug_1": BallRegion((0.0, 0.0, 1.2), 0.2)})
     with agent(lambda graph: TaskRelevanceEstimator(graph, mug)) as a:
-        assigned = a.client.assign_task("Pick up the mug on the table")
-        searched, unsupported, not_seen = a.client.status().notes
-    assert assigned.warnings == ("no region matches 'table'; the regions are mug_1",)
-    assert searched == "'mug' is searched as 'mug_1' (ground truth): 0 detections, best score 0.00, 0 confirmed"
+        assigned = a.client.assign_task("There is a victim behind me. Pick up the mug on the table")
+        searched, unsupported, not_seen, lost = a.client.status().notes
+    assert assigned.warnings == (lost, "no region matches 'table'; the regions are mug_1")
+    assert lost == "'victim' is not part of the task"
+    assert searched == "'mug' is searched as 'mug_1' (ground truth): not seen so far; point at it if a frame shows it"
     assert unsupported.startswith("no region matches 'table'")
     assert not_seen.startswith("no class of the detector is a 'table': the height of what an object stands on decides")
 

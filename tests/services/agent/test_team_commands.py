@@ -74,6 +74,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
             (["objects", str(tmp_path / "none")], "output folder of a run: expected HOST:PORT"),
             (["end", fusion.client.address], "another service listens there"),
             (["fetch", a.client.address, "--out", str(tmp_path / "x.ply")], "another service listens there"),
+            (["fetch", fusion.client.address, "--out", str(tmp_path / "x.ply")], "the map is empty: the server has no"),
             (["fetch", fusion.client.address, "--strategy", "refined", "--out", str(tmp_path / "x.ply")], "refine"),
             (["refine", fusion.client.address, "--out", "/dev/null/x"], "/dev/null"),
         ):

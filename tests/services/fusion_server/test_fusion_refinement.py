@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset, photograph
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from plugin_entries import register
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
+    MissingPluginError,
     QuotaError,
 )
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings
+from gausslite.plugins import Group
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
 
@@ -108,3 +111,9 @@ def test_health_answers_while_a_refinement_runs() -> None:
             answer = check(health_pb2.HealthCheckRequest(service="gausslite.v1.FusionService"), timeout=5)
             assert answer.status == health_pb2.HealthCheckResponse.SERVING
         running.close()
+
+
+def test_a_server_without_a_plug_in_refuses_a_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
+    register(monkeypatch, Group.REFINERS)
+    with fusion_server() as t, pytest.raises(MissingPluginError, match="refinement: expected a plug-in"):
+        list(t.client.refine())

@@ -22,7 +22,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import FrameFit
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings, MissionConfig
-from gausslite.fusion.refinement import MapRenderer
+from gausslite.fusion.map_renderer import MapRenderer
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.channel import require_serving

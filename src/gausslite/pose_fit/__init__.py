@@ -1,1 +1,0 @@
-"""Fits of camera poses and of exposure to images, by brightness and by features."""

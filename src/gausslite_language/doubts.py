@@ -1,0 +1,61 @@
+"""Count the words of a sentence against its graph: nouns that it lost, and names that end in an unknown word."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from gausslite_language import lexicon
+from gausslite_language.chunk import noun_phrase
+from gausslite_language.clause_types import ClauseType, clause_types
+from gausslite_language.graph_draft import GraphDraft
+from gausslite_language.lexicon import singular
+from gausslite_language.spelling import is_in_dictionary
+from gausslite_language.tags import Tag, is_english
+
+_NO_NAMES: Final = (
+    *(lexicon.ADDRESSEES, lexicon.TASK_NOUNS, lexicon.PLACES, lexicon.MEASURES, lexicon.ROUTES, lexicon.BODY_PARTS),
+    *(lexicon.MANNER_NOUNS, lexicon.TIME_NOUNS, lexicon.DEFECTS),
+)
+_NO_OBJECTS: Final = frozenset({"one", "ones"}).union(*_NO_NAMES)
+_PREDICATES: Final = frozenset({Tag.VERB, Tag.AUXILIARY, Tag.PARTICIPLE})
+_BEFORE_STATES: Final = frozenset({Tag.AUXILIARY, Tag.PRONOUN})
+
+
+def lost_nouns(tagged: Sequence[tuple[str, Tag]], draft: GraphDraft) -> tuple[str, ...]:
+    """Return the nouns of a sentence that are in no part of its graph and in no warning.
+
+    Reasons, who acts in a statement, rooms, states ("I am hungry") and one side of an "of" do not count.
+    """
+    names = (*draft.targets, *draft.anchors, *draft.excluded, *draft.context, *draft.warnings)
+    used = {singular(word.strip("'")) for name in names for word in name.split()} | _NO_OBJECTS
+    types, clause = clause_types(tagged), ClauseType.REQUEST
+    lost: dict[str, None] = {}
+    padded = [("", None), ("", None), *tagged, ("", None), ("", None)]
+    for index, (word, tag) in enumerate(tagged):
+        clause = types.get(index, clause)
+        before, next_tag = padded[index + 1][1], padded[index + 3][1]
+        acts = clause is ClauseType.REASON or (clause is ClauseType.STATEMENT and next_tag in _PREDICATES)
+        if tag is not Tag.NOUN or next_tag is Tag.NOUN or acts or before in _BEFORE_STATES:
+            continue
+        if not ({word, singular(word)} & used or lexicon.is_space((word,)) or _is_amount(tagged, index, used)):
+            lost[singular(word)] = None
+    return tuple(lost)
+
+
+def _is_amount(tagged: Sequence[tuple[str, Tag]], index: int, used: set[str]) -> bool:
+    """Return True for both sides of an "of" if the graph has one of them: "a bar of soap", "a bottle of water"."""
+    words = [word for word, _ in tagged]
+    content = next((word for word, tag in tagged[index + 2 : index + 5] if tag is Tag.NOUN), "")
+    before = [at for at in range(max(index - 3, 0), index) if words[at] == "of"]
+    container = words[before[-1] - 1] if before and before[-1] else ""
+    return bool({singular(content) if words[index + 1 : index + 2] == ["of"] else "", singular(container)} & used)
+
+
+def unknown_names(draft: GraphDraft) -> tuple[str, ...]:
+    """Return the names of a graph that end in a word which no list has, or only as a verb or an adjective."""
+    phrases = (*draft.targets, *draft.anchors, *draft.excluded)
+    nouns = (noun_phrase(phrase.split(), False) for phrase in phrases)
+    return tuple(
+        noun.text for noun in nouns if not noun.is_known and (is_english(noun.head) or not is_in_dictionary(noun.head))
+    )

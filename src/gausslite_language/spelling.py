@@ -1,0 +1,84 @@
+"""Read what was typed in a hurry: abbreviations of chat, and unknown words with one typing error."""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+from importlib import resources
+from typing import Final
+
+from symspellpy.editdistance import DistanceAlgorithm, EditDistance
+
+from gausslite_language.nouns import vocabulary
+from gausslite_language.tags import is_english
+from gausslite_language.verbs import TABLES, word_set
+
+_SHORT_FORMS: Final[dict[str, str]] = TABLES["abbreviations"]
+_SHORT_FORM: Final = re.compile(rf"(?<![\w/'-])(?:{'|'.join(map(re.escape, _SHORT_FORMS))})(?![\w/'-])")
+_NAME: Final = re.compile(r"(?<=[\w,] )[A-Z]\w+")
+_WORD: Final = re.compile(r"(?<![\w'])[^\W\d_]{3,}(?![\w'])")
+_LISTED: Final = frozenset().union(*(word_set(line) for line in TABLES.values() if isinstance(line, str)))
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A sentence without the errors that were found, and a warning for each."""
+
+    text: str
+    warnings: tuple[str, ...] = ()
+
+
+def read_typed(text: str, normalised: str) -> Reading:
+    """Return the reading of a normalised text. Words with a capital inside the original text are names, and stay."""
+    names = {name.casefold() for name in _NAME.findall(text)}
+    plain = _SHORT_FORM.sub(lambda match: _SHORT_FORMS[match[0]], normalised)
+    words = dict.fromkeys(_WORD.findall(plain))
+    unknown = [word for word in words if word not in names and not is_english(word)]
+    corrected = {word: nearest for word in unknown if (nearest := nearest_word(word)) is not None}
+    # a text of strange words is not English with typing errors
+    if len(unknown) - len(corrected) > len(words) - len(unknown):
+        corrected = {}
+    if corrected:
+        plain = _WORD.sub(lambda match: corrected.get(match[0], match[0]), plain)
+    return Reading(plain, tuple(f"{word!r} is read as {nearest!r}" for word, nearest in corrected.items()))
+
+
+@functools.lru_cache(maxsize=1024)
+def nearest_word(word: str) -> str | None:
+    """Return the known word that is one typing error away; None for an English word, and without such a word."""
+    frequencies = _frequencies()
+    if word in frequencies:
+        return None
+    distance = EditDistance(DistanceAlgorithm.DAMERAU_OSA_FAST)
+    near = [
+        known
+        for known in frequencies.keys() | vocabulary().senses.keys()
+        if abs(len(known) - len(word)) < 2 and distance.compare(word, known, 1) == 1
+    ]
+    usable = [known for known in near if known.isalpha() and is_english(known)]
+    return min(
+        usable,
+        key=lambda known: (_error(word, known), known not in _LISTED, -frequencies.get(known, 0), known),
+        default=None,
+    )
+
+
+def is_in_dictionary(word: str) -> bool:
+    """Return True for an English word, also of a kind that the parser has no list of."""
+    return word in _frequencies()
+
+
+def _error(typed: str, meant: str) -> int:
+    """Return the rank of the typing error, the likeliest first: letters swapped, one missing, one too many, another."""
+    if sorted(typed) == sorted(meant):
+        return 0
+    return 1 if len(meant) > len(typed) else 2 if len(meant) < len(typed) else 3
+
+
+@functools.cache
+def _frequencies() -> dict[str, int]:
+    """Return how often each English word occurs. The library's file is read once, at the first unknown word."""
+    path = resources.files("symspellpy").joinpath("frequency_dictionary_en_82_765.txt")
+    rows = (line.split() for line in path.read_text(encoding="utf-8-sig").splitlines())
+    return {word: int(count) for word, count in rows}

@@ -1,0 +1,1 @@
+"""Goals and views of mapped objects for programs, and for language models by the Model Context Protocol."""

@@ -1,0 +1,201 @@
+"""A place that programs ask: the objects and the map of a run's folder, or of a fusion server."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from threading import RLock
+from typing import Final, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Float64, Int8
+from numpy import ndarray
+
+from gausslite.codec.ply import gaussians_from_ply
+from gausslite.codec.run_files import KeyframeView, read_keyframe_views
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import move_gaussians
+from gausslite.domain.objects import TeamObject
+from gausslite.domain.pose import UpAxis
+from gausslite.render.rasterizer import Rendering
+from gausslite.wire.channel import require_callable
+from gausslite.wire.clients import Export, FusionClient
+from gausslite.wire.convert import camera_from_message, transform_from_message
+from gausslite.wire.security import Tls
+from gausslite_export.formats import upright_motion
+from gausslite_export.free_cells import free_voxels
+from gausslite_export.occupancy import (
+    NO_VOXELS,
+    OccupancySettings,
+    floor_layer,
+    planar_grid,
+    require_voxels,
+)
+from gausslite_language.mapped_objects import MappedObjects, query, read_folder
+from gausslite_render.splat_map import SplatMap, read_splats
+from gausslite_render.viewer import SplatViewer
+
+_Value = TypeVar("_Value")
+_MAX_VIEWS: Final = 48
+_FREE_VIEWS: Final = 16
+"""Keyframes that a place uses, for views and for free space, evenly in their order: more take longer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorGrid:
+    """Cells in x and y of the upright map: the values of `gausslite_export.occupancy`, and where they lie.
+
+    origin_m: lower corner of the first cell. floor_m: height of the floor. T_upright_map: turns the map upright.
+    """
+
+    cells: Int8[ndarray, "h w"]
+    origin_m: Float64[ndarray, "2"]
+    cell_m: float
+    floor_m: float
+    T_upright_map: Float64[ndarray, "4 4"]
+
+
+@dataclass(eq=False)
+class Scene:
+    """A map to look at, with the views that its keyframes saw, oldest first. Its methods are thread-safe."""
+
+    splats: SplatMap
+    views: Sequence[KeyframeView]
+    up_axis: UpAxis
+    threads: int | None = None
+    _lock: RLock = field(default_factory=RLock, repr=False)
+
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
+        """Return the map's rendering from a pose."""
+        with self._lock:
+            return self._viewer.render(camera, T_world_camera)
+
+    @cached_property
+    def _viewer(self) -> SplatViewer:
+        return SplatViewer(self.splats, self.threads)
+
+    def floor(self) -> FloorGrid:
+        """Return the grid of what a robot can drive on, as `gausslite export --to nav2` writes it.
+
+        Raises InvalidInputError for a map without anything that occupies space.
+        """
+        with self._lock:
+            return self._floor
+
+    @cached_property
+    def _floor(self) -> FloorGrid:
+        T, settings = upright_motion(np.array(self.up_axis)), OccupancySettings()
+        gaussians = move_gaussians(self.splats.gaussians, T)
+        occupied, free = require_voxels(gaussians, settings), NO_VOXELS
+        if self.views:
+
+            def render(camera: Camera, T_upright_camera: Float64[ndarray, "4 4"]) -> Rendering:
+                return self.render(camera, T.T @ T_upright_camera)
+
+            views = [
+                KeyframeView(v.index, v.capture_time_ns, v.camera, T @ v.T_world_camera, v.roi_pixels)
+                for v in evenly(self.views, _FREE_VIEWS)
+            ]
+            free = free_voxels(views, render, occupied, occupied, settings.voxel_m)
+        cells, first = planar_grid(occupied, free, settings)
+        floor_m = (floor_layer(occupied) + 1) * settings.voxel_m
+        return FloorGrid(cells, first * settings.voxel_m, settings.voxel_m, floor_m, T)
+
+
+class Place(Protocol):
+    """What `gausslite mcp` serves."""
+
+    @property
+    def name(self) -> str:
+        """How the user named it."""
+        ...
+
+    def objects(self) -> MappedObjects:
+        """Return the objects of now. Raises UnavailableError."""
+        ...
+
+    def scene(self) -> Scene:
+        """Return the map of now. Raises UnavailableError, MapFileError."""
+        ...
+
+
+class RunPlace:
+    """A run's folder, read once."""
+
+    def __init__(self, folder: Path, threads: int | None = None) -> None:
+        """Raises InvalidInputError, MapFileError, CodecError."""
+        self.name = str(folder)
+        self._objects = read_folder(folder)
+        views = evenly(read_keyframe_views(folder), _MAX_VIEWS)
+        self._scene = Scene(read_splats(folder), views, self._objects.up_axis, threads)
+
+    def objects(self) -> MappedObjects:
+        """Return the objects of report.json."""
+        return self._objects
+
+    def scene(self) -> Scene:
+        """Return the map of map.ply."""
+        return self._scene
+
+
+class ServerPlace:
+    """A fusion server: each call sees its objects of now; the map is fetched again when its revision has changed."""
+
+    def __init__(self, address: str, tls: Tls | None = None, threads: int | None = None) -> None:
+        require_callable("a fusion server or the output folder of a run", address)
+        self.name, self._tls, self._threads = address, tls, threads
+        self._lock, self._revision = RLock(), -1
+        self._scene: Scene | None = None
+
+    def objects(self) -> MappedObjects:
+        """Return the team's objects. Raises UnavailableError."""
+        return query(self.name, self._tls)
+
+    def scene(self) -> Scene:
+        """Return the fused map with the keyframes that the server has. Raises UnavailableError."""
+        with self._lock, FusionClient(self.name, tls=self._tls) as client:
+            status = client.status()
+            if self._scene is None or status.fused_revision != self._revision:
+                gaussians = gaussians_from_ply(client.export(Export()))
+                if not len(gaussians):
+                    raise InvalidInputError(f"{self.name}: expected a map with Gaussians, got an empty one")
+                splats = SplatMap(gaussians, np.zeros((len(gaussians), 3, 0), np.float32))
+                agents = [agent.agent_id for agent in status.agents if agent.keyframes]
+                views = [view for agent_id in agents for view in _agent_views(client, agent_id)]
+                self._scene = Scene(splats, evenly(views, _MAX_VIEWS), (0.0, 0.0, 1.0), self._threads)
+                self._revision = status.fused_revision
+            return self._scene
+
+
+def open_place(place: str, tls: Tls | None = None, threads: int | None = None) -> Place:
+    """Return the place of a folder's path or a server's address. Raises InvalidInputError, MapFileError."""
+    return RunPlace(Path(place), threads) if Path(place).is_dir() else ServerPlace(place, tls, threads)
+
+
+def find_object(objects: MappedObjects, name: str) -> TeamObject:
+    """Return the object of an id, or the most confident one of a noun. Raises InvalidInputError, which lists ids."""
+    found = [known_object for known_object in objects.objects if known_object.landmark.object_id == name]
+    found = found or [known_object for known_object in objects.objects if known_object.landmark.noun == name]
+    if not found:
+        known = ", ".join(known_object.landmark.object_id for known_object in objects.objects[:20]) or "none"
+        raise InvalidInputError(f"object: expected the id or the noun of an object, got {name[:80]!r}; ids are {known}")
+    return max(found, key=lambda each: each.landmark.confidence)
+
+
+def _agent_views(client: FusionClient, agent_id: str) -> list[KeyframeView]:
+    """Return the poses of an agent's keyframes in the fused map, without their images."""
+    views = []
+    for index in evenly(client.keyframe(agent_id).indices, _MAX_VIEWS):
+        message = client.keyframe(agent_id, index)
+        if message.HasField("t_world_camera"):
+            T = transform_from_message("t_world_camera", message.t_world_camera)
+            views.append(KeyframeView(index, message.capture_time_ns, camera_from_message(message.camera), T, 0))
+    return views
+
+
+def evenly(values: Sequence[_Value], count: int) -> list[_Value]:
+    """Return at most `count` of the values, evenly in their order, with the last one."""
+    return list(values[::-1][:: max(1, -(-len(values) // count))][::-1])

@@ -1,0 +1,48 @@
+"""Build GaussLite by scikit-build-core: in the source's build folder if that can be written, else in a temporary one.
+
+Root's clones and read-only mounts can be installed so; elsewhere the build folder lets a second installation skip the
+kernels' compilation.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from scikit_build_core import build
+
+get_requires_for_build_sdist = build.get_requires_for_build_sdist
+get_requires_for_build_wheel = build.get_requires_for_build_wheel
+get_requires_for_build_editable = build.get_requires_for_build_editable
+prepare_metadata_for_build_wheel = build.prepare_metadata_for_build_wheel
+prepare_metadata_for_build_editable = build.prepare_metadata_for_build_editable
+build_sdist = build.build_sdist
+
+
+def _can_build_here() -> bool:
+    """True if this user can write the source's build folder and all in it."""
+    folder = Path("build")
+    if not folder.exists():
+        return os.access(".", os.W_OK)
+    return all(os.access(path, os.W_OK) for path in (folder, *folder.iterdir()))
+
+
+def _build(
+    of_kind: Callable[..., str],
+    wheel_directory: str,
+    config_settings: dict[str, Any] | None = None,
+    metadata_directory: str | None = None,
+) -> str:
+    settings = dict(config_settings or {})
+    if "build-dir" in settings or _can_build_here():
+        return of_kind(wheel_directory, settings, metadata_directory)
+    with tempfile.TemporaryDirectory(prefix="gausslite-build-") as folder:
+        return of_kind(wheel_directory, {**settings, "build-dir": folder}, metadata_directory)
+
+
+build_wheel = partial(_build, build.build_wheel)
+build_editable = partial(_build, build.build_editable)
