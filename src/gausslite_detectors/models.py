@@ -34,6 +34,12 @@ _TRANSFORMERS: Final = 'pip install "transformers<5" torch onnx\n'
 
 CATALOGUE: Final = (
     ModelEntry(
+        "rf-detr-seg", "rfdetr-seg-nano.onnx", "--detector: 80 classes with masks", "Apache-2.0",
+        project="RF-DETR, Roboflow",
+        export="""pip install "rfdetr[onnx]"
+python -c "from rfdetr import RFDETRSegNano; RFDETRSegNano().export(output_dir='.')\"""",
+    ),
+    ModelEntry(
         "grounding-dino", "grounding-dino.onnx", "--detector: any noun phrase, boxes", "Apache-2.0",
         project="Grounding DINO, IDEA-Research",
         export=_TRANSFORMERS + "tools/export_model.py grounding-dino IDEA-Research/grounding-dino-tiny models",
@@ -171,7 +177,7 @@ class OnnxReader:
 
     def advice(self) -> str:
         """Return how to make the simplest file, in one line."""
-        entry = entry_named("yolo-seg")
+        entry = entry_named("rf-detr-seg")
         commands = entry.export.replace("\n", " && ")
         return f"make {entry.file_name} ({entry.licence}) with: {commands}"
 

@@ -6,9 +6,8 @@ import functools
 import re
 from dataclasses import dataclass
 from importlib import resources
+from string import ascii_lowercase
 from typing import Final
-
-from symspellpy.editdistance import DistanceAlgorithm, EditDistance
 
 from gausslite_language.nouns import vocabulary
 from gausslite_language.tags import is_english
@@ -50,13 +49,8 @@ def nearest_word(word: str) -> str | None:
     frequencies = _frequencies()
     if word in frequencies:
         return None
-    distance = EditDistance(DistanceAlgorithm.DAMERAU_OSA_FAST)
-    near = [
-        known
-        for known in frequencies.keys() | vocabulary().senses.keys()
-        if abs(len(known) - len(word)) < 2 and distance.compare(word, known, 1) == 1
-    ]
-    usable = [known for known in near if known.isalpha() and is_english(known)]
+    near = _with_one_error(word) & (frequencies.keys() | vocabulary().senses.keys())
+    usable = [known for known in near if is_english(known)]
     return min(
         usable,
         key=lambda known: (_error(word, known), known not in _LISTED, -frequencies.get(known, 0), known),
@@ -67,6 +61,16 @@ def nearest_word(word: str) -> str | None:
 def is_in_dictionary(word: str) -> bool:
     """Return True for an English word, also of a kind that the parser has no list of."""
     return word in _frequencies()
+
+
+def _with_one_error(word: str) -> set[str]:
+    """Return what one typing error makes of a word: two letters swapped, one missing, one too many, or another."""
+    parts = [(word[:place], word[place:]) for place in range(len(word) + 1)]
+    swapped = {f"{head}{tail[1]}{tail[0]}{tail[2:]}" for head, tail in parts if len(tail) > 1}
+    shorter = {head + tail[1:] for head, tail in parts if tail}
+    longer = {head + letter + tail for head, tail in parts for letter in ascii_lowercase}
+    other = {head + letter + tail[1:] for head, tail in parts if tail for letter in ascii_lowercase}
+    return (swapped | shorter | longer | other) - {word}
 
 
 def _error(typed: str, meant: str) -> int:

@@ -47,7 +47,7 @@ def test_a_working_machine_has_no_error_and_the_findings_are_true(tmp_path: Path
     assert checks["rasterizer"]["finding"].startswith(f"backend {choose_rasterizer('auto').name}, because ")
     assert version("gausslite") in checks["package"]["finding"]
     assert [name for name in checks if name.startswith("model")] == ["models"]
-    assert "pip install ultralytics && yolo export model=yolo11n-seg.pt" in checks["models"]["advice"]
+    assert "RFDETRSegNano().export(output_dir='.')" in checks["models"]["advice"]
     extras = {name.removeprefix("extra ") for name in checks if name.startswith("extra ")}
     absent = checks["extras"]["finding"].removeprefix("not installed: ").split(", ") if "extras" in checks else []
     assert extras.union(absent) == set(metadata("gausslite").get_all("Provides-Extra") or ())

@@ -46,8 +46,8 @@ def items(page: MapPage) -> Iterator[Any]:
 
 
 def control(page: MapPage, label: str) -> Any:
-    """Return the control with this label."""
-    return next(item for item in items(page) if getattr(item, "label", None) == label)
+    """Return the control with this label; a folder, which has no value, may have the same one."""
+    return next(item for item in items(page) if hasattr(item, "value") and getattr(item, "label", None) == label)
 
 
 def text(page: MapPage) -> str:

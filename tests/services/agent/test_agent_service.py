@@ -200,7 +200,8 @@ def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() 
         opened.set()
         assert first.result(20).graph.text == TASK
         [newest] = [call for call in storm if not is_refused(call)]
-        assert a.client.status().graph.text == newest.result(20).graph.text
+        assigned = newest.result(20).graph.text
+        assert a.client.status().graph.text == assigned
     refused = next(call for call in storm if is_refused(call))
     assert refused.details() == "task: superseded by a newer AssignTask before it was assigned"
 
