@@ -32,6 +32,9 @@ _LOST_AFTER = 3
 """Doubtful frames in a row: a person before the camera hides a map for one or two at 2 Hz."""
 _AGREEING: Final = {LocalisationState.DOUBTFUL: 1, LocalisationState.LOST: 2}
 """Frames in a row that must agree with the map at the odometry's own poses."""
+_KNOWN_AFTER = 3
+"""Frames that must have agreed with the map before one can contradict it: images that never fit the poses are no sign
+of a lost robot."""
 _MAX_WAITING = 16
 """Frames with images: 34 MB at 640x480."""
 _CONTRADICTION: Final = "its images contradict the map"
@@ -58,7 +61,8 @@ class FrameMonitor(LocalisationMonitor):
         self._cause, self._goes_on = "", False
         # of the present doubt: its first frame; frames so far; the latest ones in a row that agree, or leave it open
         self._since = self._doubtful = self._agreed = self._open = 0
-        self._doubts = self._found = 0
+        # of the mission: frames that agreed, doubts, places that were found
+        self._known = self._doubts = self._found = 0
 
     @property
     def localisation(self) -> LocalisationState:
@@ -81,7 +85,7 @@ class FrameMonitor(LocalisationMonitor):
         self._newest = frame
         self._earlier = [view.keyframe.frame for view in mapper.store.window[-_EARLIER:]]
         doubt = self._steps.add(frame)
-        if doubt is not None:
+        if doubt is not None and self._known >= _KNOWN_AFTER:
             self._begin_doubt(frame, doubt)
             self._begin_odometry()
             if self._check is not None:
@@ -100,7 +104,9 @@ class FrameMonitor(LocalisationMonitor):
         """Return False if a frame contradicts the map; see `LocalisationMonitor.confirm`."""
         is_recovered = frame.id in self._recovered
         self._recovered.discard(frame.id)
-        if compare(frame, view.rendered, self._earlier) is not Agreement.CONTRADICTS:
+        agreement = compare(frame, view.rendered, self._earlier)
+        self._known += agreement is Agreement.AGREES
+        if agreement is not Agreement.CONTRADICTS or self._known < _KNOWN_AFTER:
             return True
         if not is_recovered and self._newest is not None:
             self._begin_doubt(frame, Doubt(_CONTRADICTION))
@@ -111,12 +117,13 @@ class FrameMonitor(LocalisationMonitor):
 
     def state(self) -> State:
         """Return the state, the counts and the odometry's steps; frames that wait are not saved."""
-        counts = int_array(self._localisation, self._since, self._doubtful, self._doubts, self._found)
-        return {"counts": counts, **add_prefix("steps", self._steps.state())}
+        counts = self._localisation, self._since, self._doubtful, self._known, self._doubts, self._found
+        return {"counts": int_array(*counts), **add_prefix("steps", self._steps.state())}
 
     def restore(self, state: State) -> None:
         """Continue from another monitor's state. Raises MapFileError, PoseError."""
-        localisation, self._since, self._doubtful, self._doubts, self._found = get_counts(state, "counts", 5)
+        localisation, self._since, self._doubtful, *counts = get_counts(state, "counts", 6)
+        self._known, self._doubts, self._found = counts
         self._localisation = LocalisationState(min(localisation, LocalisationState.LOST))
         self._cause = "it was so when the mission was saved"
         self._steps.restore(select_prefix(state, "steps"))
