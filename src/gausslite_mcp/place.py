@@ -34,7 +34,7 @@ from gausslite_export.occupancy import (
     planar_grid,
     require_voxels,
 )
-from gausslite_language.mapped_objects import MappedObjects, query, read_folder
+from gausslite_objects.mapped_objects import MappedObjects, query, read_folder
 from gausslite_render.splat_map import SplatMap, read_splats
 from gausslite_render.viewer import SplatViewer
 

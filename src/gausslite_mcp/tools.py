@@ -18,11 +18,11 @@ from gausslite.domain.checks import require_instance
 from gausslite.domain.errors import InvalidInputError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.security import Tls
-from gausslite_language.mapped_objects import as_json, select
 from gausslite_mcp.context import relations_of
 from gausslite_mcp.goals import GoalSettings, goal_near
 from gausslite_mcp.object_views import VIEW_CAMERA, best_view, look_at
 from gausslite_mcp.place import Place, Scene, find_object
+from gausslite_objects.mapped_objects import as_json, select
 
 _JPEG_QUALITY = 90
 _FOV_DEG = (20.0, 120.0)
@@ -41,7 +41,7 @@ class PlaceTools:
         """Return the objects that a question means, or all, as `gausslite objects --json` prints them."""
         objects = self.place.objects()
         chosen, notes = select(objects, question)
-        values = [as_json(found, objects.box(found)) for found in chosen]
+        values = [as_json(found, objects) for found in chosen]
         return _rounded({"count": len(values), "objects": values, "notes": [*notes, *objects.notes]})
 
     def object_context(self, name: str) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class PlaceTools:
         found = find_object(objects, name)
         others = [other.landmark for other in objects.objects]
         relations = relations_of(found.landmark, others, objects.up_axis)
-        return _rounded({"object": as_json(found, objects.box(found)), **relations})
+        return _rounded({"object": as_json(found, objects), **relations})
 
     def goal_near(
         self, name: str, distance_m: float, radius_m: float, from_m: Sequence[float] | None

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from gausslite.config.command_parser import CommandParser
-from gausslite_places.map_diff import Change
+from gausslite_objects.changes import Change
 from gausslite_places.prior_map import SavedMap, compare_runs
 
 
@@ -25,5 +25,5 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"changes": [change.as_json() for change in changes]}))
     else:
-        print("\n".join(map(Change.describe, changes)) or "nothing changed that both runs saw")
+        print("\n".join(map(Change.describe, changes)) or "no change in what both runs saw")
     return 0

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.codec.json import object_from_json
@@ -19,11 +19,12 @@ from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, translation_m
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.mapping.free_space import DepthView
 from gausslite.mission.results import MAP, read_report
 from gausslite.render.map_viewer import MapViewer, view_map
+from gausslite_objects.changes import Change, compare_visits
+from gausslite_objects.visit import Visit, depth_views, read_depths
 from gausslite_places.localisation import PlaceMap, rendered_frame
-from gausslite_places.map_diff import Change, Visit, compare_visits
+from gausslite_places.surface_registration import Surface, register
 
 MAX_LOCALISED_FRAMES = 12
 _NEEDED = 2
@@ -34,11 +35,15 @@ _AGREE_M, _AGREE_DEG = 0.3, 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedMap:
-    """The map of a finished run with its keyframes' poses, its objects and its task's text."""
+    """The map of a finished run with its keyframes' poses, its objects and its task's text.
+
+    depths_m: reduced depth images by the index of their keyframe.
+    """
 
     folder: Path
     gaussians: Gaussians
     keyframes: Sequence[KeyframeView]
+    depths_m: Mapping[int, Float32[ndarray, "h w"]]
     objects: tuple[ObjectLandmark, ...]
     task: str
     world_frame: str
@@ -63,12 +68,13 @@ class SavedMap:
             raise MapFileError(f"{folder}: expected a report.json with the run's objects: {error}") from error
         task = report.get("task")
         return cls(
-            folder,
-            gaussians,
-            keyframes,
-            objects,
-            str(task.get("text", "")) if isinstance(task, dict) else str(task or ""),
-            read_world_frame(folder / MAP),
+            folder=folder,
+            gaussians=gaussians,
+            keyframes=keyframes,
+            depths_m=read_depths(folder, keyframes),
+            objects=objects,
+            task=str(task.get("text", "")) if isinstance(task, dict) else str(task or ""),
+            world_frame=read_world_frame(folder / MAP),
         )
 
     def gaussians_for(self, task: str) -> Gaussians:
@@ -84,10 +90,9 @@ class SavedMap:
         objects = tuple(landmark.moved(T) for landmark in self.objects)
         return replace(self, gaussians=move_gaussians(self.gaussians, T), keyframes=keyframes, objects=objects)
 
-    def depth_views(self, viewer: MapViewer) -> list[DepthView]:
-        """Return the depth that the keyframes saw, as rendered by a viewer of this map."""
-        frames = (rendered_frame(viewer.render, view.camera, view.T_world_camera) for view in self.keyframes)
-        return [DepthView.of_frame(frame) for frame in frames]
+    def visit(self) -> Visit:
+        """Return what the run knows of its place."""
+        return Visit(self.gaussians, self.objects, *depth_views(self.keyframes, self.depths_m))
 
     def places(self, viewer: MapViewer) -> PlaceMap:
         """Return the map's keyframes as rendered by a viewer of this map, to localise in."""
@@ -146,22 +151,22 @@ def compare_runs(before: SavedMap, after: SavedMap) -> list[Change]:
     Maps of one world frame are compared as they are. The later one is localised otherwise: MismatchError if it is not
     recognised.
     """
-    viewers = [view_map(saved.gaussians) for saved in (before, after)]
-    if before.world_frame != after.world_frame or not before.world_frame:
-        T = _motion_between(before, after, *viewers)
-        after = after.moved(T)
-        viewers[1] = view_map(after.gaussians)
-    visits = [
-        Visit(saved.gaussians, saved.objects, saved.depth_views(viewer))
-        for saved, viewer in zip((before, after), viewers, strict=True)
-    ]
-    return compare_visits(*visits)
+    if before.world_frame == after.world_frame and before.world_frame:
+        return compare_visits(before.visit(), after.visit())
+    after = after.moved(_motion_between(before, after))
+    return compare_visits(before.visit(), after.moved(fitted_motion(before.visit(), after.visit())).visit())
 
 
-def _motion_between(
-    before: SavedMap, after: SavedMap, before_viewer: MapViewer, after_viewer: MapViewer
-) -> Float64[ndarray, "4 4"]:
+def fitted_motion(before: Visit, after: Visit) -> Float64[ndarray, "4 4"]:
+    """Return the small motion that fits the later surface to the earlier one; the identity if they overlap little."""
+    source, target = (Surface.sampled(visit.surface_m) for visit in (after, before))
+    registration = register(source, target, guess=np.eye(4))
+    return np.eye(4) if registration is None else registration.T_target_source
+
+
+def _motion_between(before: SavedMap, after: SavedMap) -> Float64[ndarray, "4 4"]:
     """Return the motion of the later map into the earlier one's frame. Raises MismatchError."""
+    before_viewer, after_viewer = (view_map(saved.gaussians) for saved in (before, after))
     step = max(len(after.keyframes) // MAX_LOCALISED_FRAMES, 1)
     frames = (rendered_frame(after_viewer.render, view.camera, view.T_world_camera) for view in after.keyframes[::step])
     T = SequenceLocaliser(before.places(before_viewer)).localise(frames)

@@ -24,7 +24,9 @@ from gausslite.mission.prior_map import PRIOR_FOLDER, MapChanges, PriorMap
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.map_viewer import view_map
-from gausslite_places.map_diff import Change, Visit, compare_visits, with_earlier_objects
+from gausslite_objects.changes import Change, compare_visits, with_earlier_objects
+from gausslite_objects.edits import CARRIED, edits_as_json, read_edits
+from gausslite_objects.visit import Visit
 from gausslite_places.moved_source import MovedSource, moved_frame
 from gausslite_places.prior_map import MAX_LOCALISED_FRAMES, SavedMap, SequenceLocaliser
 
@@ -97,11 +99,14 @@ class PriorRun(PriorMap):
         """Return what the run's map, objects and keyframes show to have changed since the saved map."""
         changes: list[Change] = []
         if self.motion is not None:
-            before = Visit(self.saved.gaussians, self.saved.objects, self.saved.depth_views(self._viewer))
-            views = [DepthView.of_frame(keyframe.frame) for keyframe in keyframes]
-            changes = compare_visits(before, Visit(gaussians, objects, views))
+            changes = compare_visits(self.saved.visit(), _visit(gaussians, objects, keyframes))
             objects = with_earlier_objects(objects, self.saved.objects, changes)
-        report = {"prior": self._report(), "changes": [change.as_json() for change in changes]}
+        edits = () if self.motion is None else read_edits(self.saved.folder)
+        report = {
+            "prior": self._report(),
+            "changes": [change.as_json() for change in changes],
+            CARRIED: edits_as_json(edits),
+        }
         return MapChanges(objects, tuple(map(Change.describe, changes)), report)
 
     def state(self) -> State:
@@ -133,6 +138,11 @@ class PriorRun(PriorMap):
             "frames_tried": self._localiser.tried,
             "seconds": self._seconds,
         }
+
+
+def _visit(gaussians: Gaussians, objects: Sequence[ObjectLandmark], keyframes: Sequence[Keyframe]) -> Visit:
+    frames = [keyframe.frame for keyframe in keyframes]
+    return Visit(gaussians, objects, list(map(DepthView.reduced, frames)), [frame.capture_time_ns for frame in frames])
 
 
 def _frames(stream: FrameStream, spread: bool) -> Iterator[Frame]:

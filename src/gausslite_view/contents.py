@@ -15,10 +15,11 @@ from numpy import ndarray
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.arrays import require_array
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox, oriented_box
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.pose import upward_axis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite_link.map_follower import FollowedMap
+from gausslite_view.oriented_box import OrientedBox
 
 NO_AGENT = -1
 
@@ -268,13 +269,9 @@ def start_view(contents: ViewContents) -> StartView:
 
 
 def object_boxes(contents: ViewContents) -> list[OrientedBox]:
-    """Return the box of each object: that of its own Gaussians, or else of its observed cells."""
+    """Return the box of each object."""
     up_axis = upward_axis(_poses(contents))
-    return [
-        oriented_box(landmark, contents.gaussians, contents.targets, up_axis)
-        or OrientedBox.enclosing(landmark.corners_m, up_axis)
-        for landmark in contents.objects
-    ]
+    return [OrientedBox.enclosing(landmark.corners_m, up_axis) for landmark in contents.objects]
 
 
 def _poses(contents: ViewContents) -> Float64[ndarray, "n 4 4"]:

@@ -14,9 +14,10 @@ from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
-from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite_view.contents import AgentPath, StartView, ViewContents, category_colour, object_boxes
 from gausslite_view.local_server import LocalServer
+from gausslite_view.oriented_box import OrientedBox
 
 _FOV_RAD = np.deg2rad(75.0)
 """Vertical field of view of the page's camera, viser's default."""

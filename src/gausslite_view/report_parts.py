@@ -14,13 +14,14 @@ from numpy import ndarray
 from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.run_files import ViewImage
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.objects import ObjectLandmark, OrientedBox
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
 from gausslite.process import print_message, size_text
 from gausslite_evaluation.compare import TEAM_MAP
 from gausslite_evaluation.lpips import NAME as LPIPS_NAME
 from gausslite_view.contents import ViewContents, object_boxes, with_agents
+from gausslite_view.oriented_box import OrientedBox
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
 from gausslite_view.view_images import read_view_images

@@ -15,7 +15,7 @@ from numpy import ndarray
 from gausslite.codec.run_files import KeyframeView, ViewImage
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.pose import upward_axis
 from gausslite.domain.relevance import MIN_ROI_PIXELS
 from gausslite.render.map_viewer import MapViewer, view_map
@@ -29,6 +29,7 @@ from gausslite_evaluation.pictures import (
     to_uint8,
 )
 from gausslite_view.contents import ColourMode, ViewContents, colours_of, legend_of, object_boxes
+from gausslite_view.oriented_box import OrientedBox
 from gausslite_view.report_elements import element, picture, picture_url, styled
 from gausslite_view.report_parts import RunResults
 

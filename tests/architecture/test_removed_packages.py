@@ -38,6 +38,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("gausslite", "map", SEQUENCE, "--out", "refused", "--poses", "track"),
         ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "pose-prior=0.01,0.5"),
     ),
+    "gausslite_objects": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),

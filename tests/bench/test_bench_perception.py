@@ -29,7 +29,7 @@ ABSENT = TaskQuery(TaskGraph("id", "Find the vase", ("vase",), (), ()), ())
 
 def frames(count: int) -> list[Frame]:
     depth_m, rgb = np.full((120, 160), 2.0, np.float32), np.full((120, 160, 3), 99, np.uint8)
-    return [Frame(index, 0, rgb, depth_m, CAMERA, np.eye(4)) for index in range(count)]
+    return [Frame(index, index * 10**9, rgb, depth_m, CAMERA, np.eye(4)) for index in range(count)]
 
 
 class WeakDetector:

@@ -24,7 +24,7 @@ def test_the_command_lists_and_inspects(tmp_path, capsys):
     assert main(["models", "source", "dino"]) == 2
     [damaged, unknown] = capsys.readouterr().err.splitlines()
     assert "truncated" in damaged
-    assert "expected one of grounding-dino, " in unknown
+    assert "expected one of rf-detr-seg, grounding-dino, " in unknown
 
 
 def test_catalogue_names_and_files_are_distinct():

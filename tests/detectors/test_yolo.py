@@ -169,7 +169,7 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     lenient = TaskRelevanceEstimator(
         task, detector, RelevanceTrackerSettings(evidence=EvidenceSettings.accept_similar())
     )
-    frames = [replace(frame_with_red_square(), index=index) for index in range(7)]
+    frames = [replace(frame_with_red_square(), index=index, capture_time_ns=index * 10**9) for index in range(7)]
     assert not any(strict.estimate(frame).relevance.roi.any() for frame in frames)
     assert any(lenient.estimate(frame).relevance.roi.any() for frame in frames)
     assert strict.notes == ("what looks like 'laptop' is rather 'tv': not activated; --accept-similar accepts it",)
@@ -228,9 +228,8 @@ def test_an_object_with_a_far_lower_score_than_another_is_left_out(tmp_path, sco
     frame = frame_with_red_square()
     frame.rgb[16:48, 80:112, 0] = 255
     for index in range(2):
-        strict_roi, lenient_roi = (
-            each.estimate(replace(frame, index=index)).relevance.roi for each in (strict, lenient)
-        )
+        later = replace(frame, index=index, capture_time_ns=index * 10**9)
+        strict_roi, lenient_roi = (each.estimate(later).relevance.roi for each in (strict, lenient))
     left, right = slice(0, strict_roi.shape[1] // 2), slice(strict_roi.shape[1] // 2, None)
     assert {bool(strict_roi[:, half].any()) for half in (left, right)} == marked
     assert all(lenient_roi[:, half].any() for half in (left, right))

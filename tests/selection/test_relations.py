@@ -174,8 +174,8 @@ def test_scores_are_compared_only_among_objects_that_satisfy_the_relation():
     note = "'mug': 1 scored far below the best, so not activated; --accept-similar accepts all"
     for seen, notes in (([on, beside], ()), ([on, second, beside], (note,))):
         spatial = objects_of(Relation(Predicate.ON, "mug", "table"))
-        for _ in range(2):
-            spatial.observe([TABLE, *seen])
+        for time_ns in (0, 10**9):
+            spatial.observe([replace(each, time_ns=time_ns) for each in (TABLE, *seen)])
         assert spatial.selected() == ["mug"]
         assert spatial.notes == notes
 

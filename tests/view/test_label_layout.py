@@ -10,10 +10,11 @@ from few_examples import few_examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite_view.contents import StartView
 from gausslite_view.markers import label_positions_m, label_text
+from gausslite_view.oriented_box import OrientedBox
 
 VIEW = StartView((3.0, -3.0, 3.0), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0))
 

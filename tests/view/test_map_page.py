@@ -21,8 +21,8 @@ from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, MapSnapshot, write_keyframe_views, write_map_history
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
-from gausslite.domain.objects import OrientedBox
 from gausslite_view.contents import ColourMode, ViewContents, colours_of
+from gausslite_view.oriented_box import OrientedBox
 from gausslite_view.run_contents import read_contents, read_past
 
 pytest.importorskip("viser")

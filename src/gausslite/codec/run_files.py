@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.codec.state_file import read_state, write_atomic, write_png, write_state
@@ -67,6 +67,27 @@ def _view(record: Mapping[str, object]) -> KeyframeView:
     camera = Camera(**record["camera"])  # type: ignore[arg-type]
     index, time_ns, roi_pixels = (int(str(record[name])) for name in ("index", "capture_time_ns", "roi_pixels"))
     return KeyframeView(index, time_ns, camera, pose, roi_pixels)
+
+
+_DEPTH_FILE, _M_PER_UNIT = "keyframe_depth.safetensors", np.float32(0.001)
+
+
+def write_keyframe_depths(folder: Path, depths_m: Mapping[int, Float32[ndarray, "h w"]]) -> None:
+    """Write reduced depth images by the index of their keyframe, to a millimetre and 32 m. Raises StorageError."""
+    units = {str(index): depth_m / _M_PER_UNIT + 0.5 for index, depth_m in depths_m.items()}
+    largest = np.iinfo(np.int16).max
+    write_state(folder / _DEPTH_FILE, {i: np.minimum(image, largest).astype(np.int16) for i, image in units.items()})
+
+
+def read_keyframe_depths(folder: Path) -> dict[int, Float32[ndarray, "h w"]]:
+    """Return the depth images of `write_keyframe_depths`; empty without them. Raises MapFileError."""
+    path = folder / _DEPTH_FILE
+    if not path.exists():
+        return {}
+    state = read_state(path)
+    if not all(name.isdecimal() and image.ndim == 2 and image.dtype == np.int16 for name, image in state.items()):
+        raise MapFileError(f"{path}: expected depth images by the index of their keyframe, got other arrays")
+    return {int(name): image.astype(np.float32) * _M_PER_UNIT for name, image in state.items()}
 
 
 MAX_GAUSSIANS = 20_000

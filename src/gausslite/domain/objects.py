@@ -7,15 +7,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import UpAxis, transform_points
+from gausslite.domain.pose import transform_points
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
@@ -240,66 +238,6 @@ class TeamObject:
 
     landmark: ObjectLandmark
     observers: tuple[ObjectObserver, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class OrientedBox:
-    """An upright box. yaw_rad: of its longer level side, from the first level axis; size_m: along, across and up."""
-
-    centre_m: tuple[float, float, float]
-    yaw_rad: float
-    size_m: tuple[float, float, float]
-    vertical: int
-
-    @classmethod
-    def enclosing(cls, points_m: Float64[ndarray, "n 3"], up_axis: UpAxis) -> OrientedBox:
-        """Return the smallest upright box around points, at least one."""
-        vertical = int(np.argmax(np.abs(up_axis)))
-        flat = [axis for axis in range(3) if axis != vertical]
-        low, high = points_m.min(axis=0), points_m.max(axis=0)
-        centre_m = 0.5 * (low + high)  # near it, float32 is exact enough
-        offset_m, (width_m, depth_m), angle_deg = cv2.minAreaRect((points_m - centre_m)[:, flat].astype(np.float32))
-        centre_m[flat] += offset_m
-        if width_m < depth_m:
-            width_m, depth_m, angle_deg = depth_m, width_m, angle_deg + 90.0
-        x, y, z = centre_m.tolist()
-        size_m = float(width_m), float(depth_m), float(high[vertical] - low[vertical])
-        return cls((x, y, z), math.radians((angle_deg + 90.0) % 180.0 - 90.0), size_m, vertical)
-
-    @property
-    def corners_m(self) -> Float64[ndarray, "8 3"]:
-        """The corners, in binary order of the sides along, across and up."""
-        halves = (_CORNERS - 0.5) * self.size_m
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        turned = np.column_stack([halves[:, :2] @ ((cos, sin), (-sin, cos)), halves[:, 2]])
-        order = [axis for axis in range(3) if axis != self.vertical] + [self.vertical]
-        corners: Float64[ndarray, "8 3"] = np.array(self.centre_m) + turned[:, np.argsort(order)]
-        return corners
-
-
-_MIN_GAUSSIANS = 20
-_MAX_DISTANCE = 2.5
-"""Of an object's Gaussian from the middle, in median distances: some lie behind its outline. The end of a bar has 2."""
-
-
-def oriented_box(
-    landmark: ObjectLandmark, gaussians: Gaussians, targets: Sequence[str], up_axis: UpAxis
-) -> OrientedBox | None:
-    """Return the smallest upright box of the object's own Gaussians; None with fewer than 20, as those of an anchor.
-
-    A landmark's box is that of its 5 cm cells, twice as large as a mug. targets: the names that Gaussians.target
-    indexes; without them, the whole region's Gaussians count within the landmark's box.
-    """
-    box, own = landmark.extent_m, gaussians.active
-    if targets or landmark.role is not ObjectRole.TARGET:
-        indices = [index for index, name in enumerate(targets) if landmark.noun in (name, noun_of(name))]
-        own = own & np.isin(gaussians.target, indices)
-    points_m = gaussians.means_m[own].astype(np.float64)
-    points_m = points_m[box.contains(points_m)]
-    if len(points_m) < _MIN_GAUSSIANS:
-        return None
-    distances_m = np.linalg.norm(points_m - np.median(points_m, axis=0), axis=1)
-    return OrientedBox.enclosing(points_m[distances_m <= _MAX_DISTANCE * np.median(distances_m)], up_axis)
 
 
 def found_text(

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
+from gausslite.datasets.files import resize_depth
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
@@ -29,7 +30,8 @@ _NEIGHBOURS = np.ones((5, 5), np.uint8)
 _MIN_VIEWS = 3
 _MIN_RATIO = 2
 """Views that see through a point must be at least three, and twice those that show a surface there."""
-
+REDUCED_WIDTH_PX = 160
+"""Of the depth images that a run keeps: a pixel is 2 cm wide at 2.7 m."""
 
 _Pixels: TypeAlias = tuple[Int64[ndarray, " m"], Int64[ndarray, " m"], Int64[ndarray, " m"]]
 """Indices of points inside an image, and the rows and columns of their pixels."""
@@ -56,6 +58,12 @@ class DepthView:
         return cls(camera, inverse(T_world_camera), depth_m, cv2.erode(depth_m, _NEIGHBOURS))
 
     @classmethod
+    def reduced(cls, frame: Frame) -> DepthView:
+        """Return the view of a frame's reduced depth, which a run keeps."""
+        camera = frame.camera.narrower(REDUCED_WIDTH_PX)
+        return cls.of(resize_depth(frame.depth_m, (camera.width_px, camera.height_px)), camera, frame.T_world_camera)
+
+    @classmethod
     def of_frame(cls, frame: Frame) -> DepthView:
         """Return the view of a frame."""
         return cls.of(frame.depth_m, frame.camera, frame.T_world_camera)
@@ -75,6 +83,11 @@ class DepthView:
         slack_m = np.float32(_SHOWN_M) + np.float32(_SHOWN_SHARE) * z_m
         shown = (nearest_m > 0) & (z_m >= nearest_m - slack_m) & (z_m <= farthest_m + slack_m)
         return _is_before(z_m, nearest_m, _THROUGH_M, _THROUGH_SHARE), shown
+
+    def occludes(self, points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """Return the points that are behind the surface that the camera sees."""
+        z_m, nearest_m, _ = self._locate(points_m)
+        return (nearest_m > 0) & (z_m > nearest_m + np.float32(_THROUGH_M) + np.float32(_THROUGH_SHARE) * z_m)
 
     def _locate(
         self, points_m: Float32[ndarray, "n 3"]

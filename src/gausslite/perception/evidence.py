@@ -19,6 +19,8 @@ from gausslite.perception.settings import EvidenceSettings
 
 _MIN_SEEN_KNOWN = 3
 """Detections after which a landmark is known. After two with high scores, chairs' precision is 0.42 (0.48)."""
+_CERTAIN_SCORE = 0.9
+"""Of ground truth, and of few detections: the best one of a ghost in the kitchen has 0.75."""
 _WEAK_SHARE = 0.5
 """Weight of a weak detection among them: recall of a rarely found monitor 0.40 to 0.87."""
 _MIN_PRESENT_FRACTION = 0.5
@@ -58,7 +60,9 @@ class Evidence:
         if landmark.is_given:
             return LandmarkState.KNOWN
         seen, missed = landmark.seen_count, landmark.missed_count
-        has_detections = seen >= self.settings.min_seen or landmark.best_score >= self.settings.confident_score
+        has_detections = (
+            landmark.view_count >= self.settings.min_seen or landmark.best_score >= self.settings.confident_score
+        )
         is_found = seen >= self.settings.min_seen_fraction * (seen + missed)
         if not (has_detections and is_found) or self.rival(landmark) is not None:
             return LandmarkState.CANDIDATE
@@ -77,6 +81,11 @@ class Evidence:
         name, score = max(landmark.rival_scores.items(), key=lambda item: item[1], default=("", 0.0))
         return name if score > self.settings.max_rival_ratio * landmark.score_sum else None
 
+    def is_witnessed(self, landmark: Landmark) -> bool:
+        """Return True if it may be reported: one moment's detections are detail for the map, but no object yet."""
+        is_certain = landmark.is_given or landmark.best_score >= _CERTAIN_SCORE
+        return is_certain or landmark.view_count >= self.settings.min_seen
+
     def without_low_scores(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
         """Return those of one target's landmarks whose confidence is not far below the best of all."""
         found = (landmark.confidence for landmark in landmarks if not landmark.is_given)
@@ -88,10 +97,6 @@ class Evidence:
         found = landmark.seen_count + landmark.weak_count
         is_often_found = found >= _MIN_PRESENT_FRACTION * (found + landmark.missed_count)
         return landmark.is_given or landmark.missed_in_a_row == 0 or is_often_found
-
-    def needs_observation(self, landmark: Landmark) -> bool:
-        """Return True if one more observation could confirm a candidate."""
-        return self.state(landmark) is LandmarkState.CANDIDATE and landmark.seen_count + 1 >= self.settings.min_seen
 
 
 def _is_rather(other: Landmark, landmark: Landmark) -> bool:

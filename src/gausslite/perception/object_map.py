@@ -30,6 +30,8 @@ _MIN_COUNT_SHARE = 0.15
 """Observations of a cell, relative to the often observed ones, above which it belongs to the footprint."""
 _MIN_FOOTPRINT_SHARE = 0.25
 """Share of the cells that a footprint has; below, all cells count."""
+INDEPENDENT_NS, _INDEPENDENT_M = 1_000_000_000, 0.1
+"""Time or motion of the camera from which a further observation is independent."""
 _MAX_CELLS = 4000
 MAX_OBJECTS = 500
 """Objects of a task; the least observed one is dropped first."""
@@ -112,7 +114,8 @@ class Landmark:
     cells: keys of surface cells, with the number of observations of each in counts. missed_count: frames that should
     have shown the object but did not. farthest_m: the largest distance of an observation. first_seen_ns, last_seen_ns:
     capture times of its observations. number: assigned by the object map, in the order of first observations.
-    score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
+    view_count: independent observations, the last one at view_ns from view_camera_m. score_sum: sum of its
+    scores; rival_scores: sums of the scores of different things in its place. votes: of its
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
     weak_count: frames with a weak detection only, whose score is in score_sum.
     is_given: a person has pointed at it, so it exists whatever detections say. measured: its attributes so far.
@@ -130,6 +133,9 @@ class Landmark:
     first_seen_ns: int = 0
     last_seen_ns: int = 0
     number: int = 0
+    view_count: int = 1
+    view_camera_m: Float64[ndarray, "3"] | None = None
+    view_ns: int = 0
     score_sum: float = 0.0
     rival_scores: dict[str, float] = field(default_factory=dict)
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
@@ -153,6 +159,8 @@ class Landmark:
             farthest_m=observation.distance_m,
             first_seen_ns=observation.time_ns,
             last_seen_ns=observation.time_ns,
+            view_camera_m=observation.camera_m,
+            view_ns=observation.time_ns,
             score_sum=observation.score,
             rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
             votes=observation.votes,
@@ -208,6 +216,9 @@ class Landmark:
         """Merge another landmark into this one, and recompute the centroid."""
         self.is_given |= other.is_given
         self.seen_count += other.seen_count
+        if self._is_independent_of(other):
+            self.view_count += other.view_count
+            self.view_camera_m, self.view_ns = other.view_camera_m, other.view_ns
         self.weak_count += other.weak_count
         self.missed_count += other.missed_count
         self.best_score = max(self.best_score, other.best_score)
@@ -221,6 +232,13 @@ class Landmark:
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         self._add_rivals(other.rival_scores)
         self._add_cells(other)
+
+    def _is_independent_of(self, other: Landmark) -> bool:
+        """Return True if another time or viewpoint shows it: two images of one moment err alike."""
+        if abs(other.view_ns - self.view_ns) >= INDEPENDENT_NS or other.view_camera_m is None:
+            return True
+        baseline_m = 0.0 if self.view_camera_m is None else np.linalg.norm(other.view_camera_m - self.view_camera_m)
+        return bool(baseline_m >= _INDEPENDENT_M)
 
     def _add_rivals(self, scores: dict[str, float]) -> None:
         for name, score in scores.items():
@@ -244,9 +262,17 @@ class Landmark:
         return bool(inside.all())
 
     def box_m(self) -> AxisAlignedBox:
-        """Return the axis-aligned box of the footprint's cells."""
-        centres_m, half_m = self.footprint_m().astype(np.float64), 0.5 * CELL_M
-        return AxisAlignedBox.around(np.vstack([centres_m - half_m, centres_m + half_m]))
+        """Return the axis-aligned box of the surface on which the masks agree, or of the footprint's cells.
+
+        It contains no place that another noun's masks claim too: such places have votes, but no cells.
+        """
+        surface, half_m = self.votes.box, 0.5 * CELL_M
+        cells_m = self.footprint_m() if surface is None else VoxelGrid(CELL_M).centres_m(self.cells)
+        low_m, high_m = cells_m.min(axis=0) - half_m, cells_m.max(axis=0) + half_m
+        corners_m = np.stack([low_m, high_m]).astype(np.float64)
+        if surface is not None:
+            corners_m = np.clip(np.array([surface.min_m, surface.max_m]), *corners_m)
+        return AxisAlignedBox.around(corners_m)
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Return the centres of the cells that are observed often, or of all cells if those are few."""

@@ -32,7 +32,15 @@ from gausslite.nouns import is_generic
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
-from gausslite.perception.object_map import MAX_OBJECTS, Landmark, Measured, ObjectMap, Observation, describe_landmarks
+from gausslite.perception.object_map import (
+    INDEPENDENT_NS,
+    MAX_OBJECTS,
+    Landmark,
+    Measured,
+    ObjectMap,
+    Observation,
+    describe_landmarks,
+)
 from gausslite.perception.relations import NamedObjects
 from gausslite.perception.selector import open_selector
 from gausslite.perception.settings import RelevanceTrackerSettings
@@ -62,7 +70,7 @@ class RelevanceTracker:
         self._selector = open_selector(graph, matches, up)
         self._targets = TargetSelector(graph, NamedObjects(self._object_map, self._evidence, self._selector))
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
-        self._frames_since = 0
+        self._frames_since, self._keyframe_ns = 0, 0
         self._needs_observation = False
         self._known_targets: list[int] = []
         self._seen: dict[str, tuple[int, float, int]] = {}  # detections of a noun, its best score, in which frame
@@ -86,7 +94,8 @@ class RelevanceTracker:
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task by their roles, the most confident first."""
         confirmed = self._evidence.confirmed(self.landmarks)
-        kept = (found for found in confirmed if not self._targets.is_excluded(found))
+        witnessed = filter(self._evidence.is_witnessed, confirmed)
+        kept = (found for found in witnessed if not self._targets.is_excluded(found))
         return describe_landmarks([(found, self._targets.role(found)) for found in kept])
 
     def report(self, match: NounMatch) -> NounReport:
@@ -101,7 +110,7 @@ class RelevanceTracker:
         pose = np.zeros((0, 4, 4)) if self._T_world_keyframe is None else self._T_world_keyframe[None]
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
-            "keyframe_age": int_array(self._frames_since, self._needs_observation),
+            "keyframe_age": int_array(self._frames_since, self._keyframe_ns, self._needs_observation),
             "known_targets": int_array(*self._known_targets),
         }
         state |= self._selector.state()
@@ -130,7 +139,7 @@ class RelevanceTracker:
         self._selector.restore(state)
         self._object_map.restore([decode_landmark(saved, self._selector.decode(saved)) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
-        self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
+        self._frames_since, self._keyframe_ns, needs_observation = get_counts(state, "keyframe_age", 3)
         self._needs_observation = needs_observation > 0
         self._known_targets = list(get_counts(state, "known_targets", len(state.get("known_targets", ()))))
 
@@ -160,20 +169,21 @@ class RelevanceTracker:
     def update_keyframe(self, frame: Frame) -> bool:
         """Return whether this frame needs a detection, and make it the keyframe if so.
 
-        Keyframes are the first frame, every max_frames-th frame, a frame far from the keyframe, and the frame after a
-        detection whose target needs another observation.
+        Keyframes are the first frame, every max_frames-th frame, a frame far from the keyframe, and the first one that
+        is another witness of a target that the keyframe shows.
         """
         T_world_keyframe = self._T_world_keyframe
         self._frames_since += 1
         is_keyframe = (
             T_world_keyframe is None
             or self._frames_since >= self._settings.max_frames
-            or (self._needs_observation and self._frames_since == 1)
+            or (self._needs_observation and frame.capture_time_ns - self._keyframe_ns >= INDEPENDENT_NS)
             or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
             or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
         )
         if is_keyframe:
             self._T_world_keyframe, self._frames_since = frame.T_world_camera, 0
+            self._keyframe_ns = frame.capture_time_ns
         return is_keyframe
 
     def integrate(
@@ -245,7 +255,7 @@ class RelevanceTracker:
             if (landmark := self._object_map.match(observation)) is not None
         ]
         self._needs_observation = any(
-            self._evidence.needs_observation(landmark) and self._targets.target_of(observation) is not None
+            not self._evidence.is_witnessed(landmark) and self._targets.target_of(observation) is not None
             for landmark, _, observation in shown
         )
         return [(landmark, mask) for landmark, mask, _ in shown]
@@ -308,6 +318,8 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "seen_missed": int_array(landmark.seen_count, landmark.missed_count, landmark.missed_in_a_row),
         "weak_given": int_array(landmark.weak_count, landmark.is_given),
         "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
+        "views": np.array([landmark.view_count, landmark.view_ns], np.int64),
+        "view_camera_m": np.zeros((0, 3)) if landmark.view_camera_m is None else landmark.view_camera_m[None],
         "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
         "rival_names": encode_text("\n".join(landmark.rival_scores)),
         "vote_keys": landmark.votes.keys,
@@ -331,6 +343,8 @@ def decode_landmark(state: State, measured: Measured | None) -> Landmark:
     weak_count, is_given = get_counts(state, "weak_given", 2)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
+    view_count, view_ns = (int(value) for value in get_array(state, "views", (2,), np.int64))
+    view_camera_m = next(iter(get_array(state, "view_camera_m", (None, 3), np.float64).copy()), None)
     keys = get_array(state, "vote_keys", (None,), np.int64).copy()
     inside, outside = get_array(state, "votes", (2, len(keys)), np.int64).copy()
     if (keys[1:] <= keys[:-1]).any() or (inside < 0).any() or (outside < 0).any():
@@ -353,6 +367,9 @@ def decode_landmark(state: State, measured: Measured | None) -> Landmark:
         first_seen_ns=first_ns,
         last_seen_ns=last_ns,
         number=number,
+        view_count=view_count,
+        view_camera_m=view_camera_m,
+        view_ns=view_ns,
         score_sum=score_sum,
         rival_scores=dict(zip(names, rival_sums, strict=True)),
         votes=SurfaceVotes(keys, inside, outside, voxel_m),

@@ -37,9 +37,10 @@ def require_plausible(section: str, settings: DataclassInstance, names: Iterable
 class EvidenceSettings:
     """When a landmark is confirmed and when it is known, and which frames should show it.
 
-    A landmark is confirmed after min_seen detections, or one of confident_score or more. Of the frames that should show
-    it, at least min_seen_fraction must have detected it. Its scores must sum to at least 1 / max_rival_ratio of those
-    of any different thing detected in its place: the nearest class of a detector is not always the class of the object.
+    A landmark is confirmed after min_seen independent detections, or one of confident_score or more. Of the frames that
+    should show it, at least min_seen_fraction must have detected it. Its scores must sum to at least 1 /
+    max_rival_ratio of those of any different thing detected in its place: the nearest class of a detector is not always
+    the class of the object.
     Its best score must be at least min_score_share of the best score among the objects of its target: jars are detected
     as bottles, with lower scores than the bottles.
     """

@@ -27,7 +27,7 @@ def frame_at(x_m: float = 0.0, index: int = 0, wall_m: float = 2.0) -> Frame:
     T_world_camera = np.eye(4)
     T_world_camera[0, 3] = x_m
     depth_m = np.full((120, 160), wall_m, np.float32)
-    return Frame(index, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
+    return Frame(index, index * 10**9, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, T_world_camera)
 
 
 def landmark_at(z_m: float = 2.0, score: float = 0.4) -> Landmark:
@@ -69,14 +69,21 @@ def test_low_scores_need_two_detections_and_high_scores_one():
     assert target_marked([0.4, None], 3) == [False, False, False]
 
 
-def test_a_first_low_score_makes_the_next_frame_a_keyframe():
-    assert target_marked([0.4], 6, max_frames=5) == [False, True, True, True, True, True]
-    no_detection, low_score = ScriptedDetector([None]), ScriptedDetector([0.4, None])
-    for detector, calls in ((no_detection, 1), (low_score, 2)):
-        estimator = TaskRelevanceEstimator(TaskGraph("id", "find the mug", ("mug",), (), ()), detector)
-        for index in range(5):
-            estimator.estimate(frame_at(index=index))
-        assert detector.calls == calls
+def test_a_second_detection_of_the_same_moment_and_place_confirms_nothing():
+    evidence = Evidence(EvidenceSettings())
+    for time_ns, camera_m, is_witnessed in (
+        (200_000_000, (0.05, 0.0, 0.0), False),
+        (200_000_000, (0.2, 0.0, 0.0), True),
+        (1_000_000_000, (0.0, 0.0, 0.0), True),
+    ):
+        for score in (0.4, 0.75):
+            landmark = landmark_at(score=score)
+            again = landmark_at(score=score)
+            again.view_ns, again.view_camera_m = time_ns, np.array(camera_m)
+            landmark.add(again)
+            assert evidence.is_witnessed(landmark) is is_witnessed
+            assert (evidence.state(landmark) is LandmarkState.CANDIDATE) is (score < 0.6 and not is_witnessed)
+    assert evidence.is_witnessed(landmark_at(score=1.0))
 
 
 def test_a_target_survives_one_missed_detection_for_each_that_found_it():
@@ -148,10 +155,10 @@ def test_the_order_of_observations_does_not_matter():
         assert mug.farthest_m == pytest.approx(2.0, abs=0.05)
 
 
-def cloud(phrase: str, score: float, *low_and_high_m: tuple[float, float]) -> Observation:
+def cloud(phrase: str, score: float, *low_and_high_m: tuple[float, float], time_s: int = 0) -> Observation:
     axes = [np.arange(low, high, 0.03) for low, high in low_and_high_m]
     points_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-    return Observation.from_points(phrase, points_m, np.zeros(3), score)
+    return Observation.from_points(phrase, points_m, np.zeros(3), score, time_s * 10**9)
 
 
 def closest_chair() -> ObservedObjects:
@@ -174,13 +181,14 @@ def test_the_closest_chair_is_found_from_a_part_of_the_table():
 
 
 def test_a_candidate_with_a_far_lower_score_does_not_decide_a_superlative():
-    table = cloud("table", 0.9, (-0.4, 0.4), (0.0, 0.05), (-0.4, 0.4))
-    low, high = (
-        cloud("chair", score, (x_m, x_m + 0.3), (-0.3, 0.3), (0.0, 0.3)) for score, x_m in ((0.3, 0.5), (0.9, 1.5))
-    )
     objects = closest_chair()
     states = []
-    for _ in range(3):
+    for time_s in range(3):
+        table = cloud("table", 0.9, (-0.4, 0.4), (0.0, 0.05), (-0.4, 0.4), time_s=time_s)
+        low, high = (
+            cloud("chair", score, (x_m, x_m + 0.3), (-0.3, 0.3), (0.0, 0.3), time_s=time_s)
+            for score, x_m in ((0.3, 0.5), (0.9, 1.5))
+        )
         objects.observe([table, low, high])
         states.append(objects.state(low))
     assert states == [LandmarkState.CANDIDATE, LandmarkState.CONFIRMED, LandmarkState.KNOWN]
@@ -191,8 +199,9 @@ def test_a_candidate_with_a_far_lower_score_does_not_decide_a_superlative():
 def test_the_thing_with_more_confidence_has_the_place():
     place = ((0.0, 0.1), (0.0, 0.1), (0.0, 0.1))
     evidence, object_map = Evidence(EvidenceSettings()), ObjectMap()
-    for _ in range(2):
-        object_map.observe([cloud("telephone", 0.8, *place), cloud("cup", 0.4, *place), cloud("mug", 0.3, *place)])
+    for time_s in range(2):
+        nouns = (("telephone", 0.8), ("cup", 0.4), ("mug", 0.3))
+        object_map.observe([cloud(noun, score, *place, time_s=time_s) for noun, score in nouns])
     assert [landmark.phrase for landmark in evidence.confirmed(object_map.objects)] == ["telephone"]
     cups = [landmark for landmark in object_map.objects if landmark.phrase != "telephone"]
     assert len(evidence.confirmed(cups)) == 2, "two words for one thing do not exclude each other"

@@ -11,7 +11,9 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.mapping.free_space import DepthView
-from gausslite_places.map_diff import Change, ChangeKind, Visit, compare_visits, with_earlier_objects
+from gausslite_objects.changes import Change, ChangeKind, compare_visits, with_earlier_objects
+from gausslite_objects.life import LifeState, life_of
+from gausslite_objects.visit import Visit
 
 WALL_M, BOX_M = 3.0, 0.4
 HERE, THERE, OUTSIDE = (-0.5, 0.0, 2.0), (0.5, 0.1, 2.0), (6.0, 0.0, 2.0)
@@ -46,7 +48,7 @@ def _visit(boxes_m: list[tuple[float, float, float]], objects: list[ObjectLandma
         T_world_camera[0, 3] = 0.1 * index
         rendering = camera.render(CAMERA, T_world_camera)
         seen.append(DepthView.of(rendering.expected_depth_m(0.8), CAMERA, T_world_camera))
-    return Visit(gaussians, objects, seen)
+    return Visit(gaussians, objects, seen, range(views))
 
 
 def test_the_same_place_has_no_changes() -> None:
@@ -58,24 +60,55 @@ def test_a_named_object_is_moved_gone_or_new() -> None:
     here, there, nowhere = _visit([HERE], [_mug(HERE)]), _visit([THERE], [_mug(THERE)]), _visit([], [])
     [moved] = compare_visits(here, there)
     assert (moved.kind, moved.before_m, moved.after_m) == (ChangeKind.MOVED, HERE, THERE)
-    assert moved.describe() == "mug: moved 1.00 m from (-0.50, 0.00, 2.00) m to (0.50, 0.10, 2.00) m"
+    size = "mug of 0.50 x 0.50 x 0.50 m"
+    assert moved.describe() == f"{size}: moved 1.00 m from (-0.50, 0.00, 2.00) m to (0.50, 0.10, 2.00) m"
     [gone] = compare_visits(here, nowhere)
-    assert gone.describe() == "mug: gone from (-0.50, 0.00, 2.00) m"
+    assert gone.describe() == f"{size}: gone from (-0.50, 0.00, 2.00) m"
     [new] = compare_visits(nowhere, there)
-    assert new.describe() == "mug: new at (0.50, 0.10, 2.00) m"
+    assert new.describe() == f"{size}: new at (0.50, 0.10, 2.00) m"
 
 
-def test_what_no_later_view_sees_is_not_gone() -> None:
-    assert compare_visits(_visit([HERE, OUTSIDE], [_mug(OUTSIDE)]), _visit([HERE], [])) == []
-    assert compare_visits(_visit([HERE], [_mug(HERE)]), _visit([], [], views=0)) == []
+def test_what_one_run_does_not_see_is_unknown() -> None:
+    here, nothing = _visit([HERE], [_mug(HERE)]), _visit([], [], views=0)
+    for before, after, line in (
+        (here, nothing, "unknown at (-0.50, 0.00, 2.00) m, out of view in the later run"),
+        (nothing, here, "unknown at (-0.50, 0.00, 2.00) m, out of view in the earlier run"),
+        (_visit([OUTSIDE], [_mug(OUTSIDE)]), here, "unknown at (6.00, 0.00, 2.00) m, out of view in the later run"),
+    ):
+        [unknown] = [change for change in compare_visits(before, after) if change.kind is ChangeKind.UNKNOWN]
+        assert unknown.describe() == f"mug of 0.50 x 0.50 x 0.50 m: {line}"
+
+
+@pytest.mark.parametrize(
+    ("boxes_m", "place_m", "state"),
+    [
+        ([HERE], HERE, LifeState.PRESENT),
+        ([], HERE, LifeState.ABSENT),
+        ([(-0.35, 0.0, 1.4)], HERE, LifeState.OCCLUDED),
+        ([HERE], OUTSIDE, LifeState.OUT_OF_VIEW),
+    ],
+)
+def test_a_thing_is_present_absent_occluded_or_out_of_view(
+    boxes_m: list[tuple[float, float, float]], place_m: tuple[float, float, float], state: LifeState
+) -> None:
+    views = _visit(boxes_m, []).views
+    life = life_of(_grid(place_m, 0.3).astype(np.float32), views, [10, 20, 30, 40])
+    assert life.state is state
+    assert life.confidence(0.8) == (0.0 if state is LifeState.ABSENT else 0.8)
+    assert life.shown_ns == (40 if state is LifeState.PRESENT else None)
+    assert life.absent_ns == (40 if state is LifeState.ABSENT else None)
+
+
+def test_what_a_single_view_measures_is_no_thing() -> None:
+    """The camera of the kitchenette measures half the distance on some pixels of one image."""
+    once = _visit([HERE], [])
+    ghost = Visit(once.gaussians, [], [once.views[0], *_visit([], []).views[1:]], range(4))
+    assert compare_visits(ghost, _visit([], [])) == []
+    assert compare_visits(Visit(once.gaussians, [], once.views[:1], [0]), _visit([], [])) == []
 
 
 def test_an_object_that_was_missed_but_whose_surface_stays_is_not_gone() -> None:
     assert compare_visits(_visit([HERE], [_mug(HERE)]), _visit([HERE], [])) == []
-
-
-def test_an_object_that_the_earlier_run_did_not_see_is_not_new() -> None:
-    assert compare_visits(_visit([], [], views=0), _visit([THERE], [_mug(THERE)])) == []
 
 
 def test_surfaces_without_a_name_are_reported() -> None:
@@ -83,7 +116,8 @@ def test_surfaces_without_a_name_are_reported() -> None:
     assert (moved.kind, moved.noun) == (ChangeKind.MOVED, "")
     assert moved.distance_m == pytest.approx(1.0, abs=0.05)
     [gone] = compare_visits(_visit([HERE], []), _visit([], []))
-    assert gone.describe().startswith("something of 0.40 x 0.40 x ")
+    assert gone.describe().startswith("something of 0.4")
+    assert gone.size_m[:2] == pytest.approx((BOX_M, BOX_M), abs=0.03)
     assert gone.as_json()["before_m"] == pytest.approx(list(HERE), abs=0.06)
 
 

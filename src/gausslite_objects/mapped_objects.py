@@ -2,45 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.json import object_as_json, object_from_json
+from gausslite.codec.json import object_as_json
 from gausslite.codec.ply import read_ply
+from gausslite.codec.run_files import read_keyframe_views
 from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import Answer, ObjectReport, OrientedBox, TeamObject, oriented_box
+from gausslite.domain.objects import Answer, ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
-from gausslite.mission.results import TRAJECTORY, read_report, stated_up
+from gausslite.mission.results import MAP, TRAJECTORY, read_report, stated_up
 from gausslite.plugins import Group, load
 from gausslite.wire.security import Tls
 from gausslite_language.rules import RuleParser
+from gausslite_objects.edit_command import reported_objects
+from gausslite_objects.edits import EditedObjects, apply_edits, read_edits
+from gausslite_objects.life import Life, life_of
+from gausslite_objects.visit import Visit, depth_views, read_depths
 
 
 @dataclass(frozen=True, slots=True)
 class MappedObjects:
-    """The objects of a map, with notes; of a folder also its Gaussians and last camera pose, None if it has none."""
+    """The objects of a map, with notes; of a folder also their lives and edits, and its last camera pose."""
 
     objects: Sequence[TeamObject]
     up_axis: UpAxis = (0.0, 0.0, 1.0)
-    targets: tuple[str, ...] = ()
-    gaussians: Gaussians | None = None
+    lives: Mapping[str, Life] = field(default_factory=dict)
+    edited: EditedObjects = field(default_factory=lambda: apply_edits((), ()))
     T_world_camera: Float64[ndarray, "4 4"] | None = None
     notes: tuple[str, ...] = ()
-
-    def box(self, team_object: TeamObject) -> OrientedBox | None:
-        """Return the upright box of the object's own Gaussians, if the map has them."""
-        if self.gaussians is None:
-            return None
-        return oriented_box(team_object.landmark, self.gaussians, self.targets, self.up_axis)
 
 
 def query(address: str, tls: Tls | None) -> MappedObjects:
@@ -58,22 +56,19 @@ def query(address: str, tls: Tls | None) -> MappedObjects:
 
 def read_folder(folder: Path) -> MappedObjects:
     """Return the objects in report.json, with what the folder has of the map. Raises InvalidInputError, CodecError."""
-    report = read_report(folder)
-    values = report.get("objects")
-    if not isinstance(values, list):
-        raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
+    report, edited = read_report(folder), apply_edits(reported_objects(folder), read_edits(folder))
     agent_id = str(report.get("agent_id") or folder.resolve().name)
     targets = report.get("targets")
     nouns = tuple(str(target) for target in targets) if isinstance(targets, list) else ()
     graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
-    objects = merge_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))})
-    map_file, trajectory = folder / "map.ply", folder / TRAJECTORY
+    objects = merge_objects({agent_id: ObjectReport(graph, edited.objects)})
+    trajectory = folder / TRAJECTORY
     poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
     return MappedObjects(
         objects,
         stated_up(report) or upward_axis(poses),
-        nouns,
-        read_ply(map_file) if map_file.is_file() else None,
+        _lives(folder, edited.objects),
+        edited,
         poses[-1] if len(poses) else None,
     )
 
@@ -92,8 +87,8 @@ def select(place: MappedObjects, question: str) -> tuple[Sequence[TeamObject], S
     return [by_id[landmark.object_id] for landmark in found.objects], found.notes
 
 
-def as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, object]:
-    """Return an object as JSON values, with its oriented box and who observed it."""
+def as_json(team_object: TeamObject, place: MappedObjects) -> dict[str, object]:
+    """Return an object as JSON values, with what views and people say of it, and who observed it."""
     observers = [
         {
             "agent_id": observer.agent_id,
@@ -105,5 +100,22 @@ def as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, objec
         }
         for observer in team_object.observers
     ]
-    oriented = {} if box is None else {"yaw_rad": box.yaw_rad, "oriented_size_m": list(box.size_m)}
-    return {**object_as_json(team_object.landmark), **oriented, "observers": observers}
+    landmark = team_object.landmark
+    life = place.lives.get(landmark.object_id)
+    edited = {
+        "life": None if life is None else life.as_json(),
+        "pinned": landmark.object_id in place.edited.pinned,
+        "notes": list(place.edited.notes.get(landmark.object_id, ())),
+    }
+    return {**object_as_json(landmark), **edited, "observers": observers}
+
+
+def _lives(folder: Path, objects: Sequence[ObjectLandmark]) -> dict[str, Life]:
+    """Return what the run's own depth says of each object by id; empty for a folder without a map or depth."""
+    keyframes = read_keyframe_views(folder)
+    depths_m = read_depths(folder, keyframes)
+    if not depths_m or not (folder / MAP).is_file():
+        return {}
+    views, times_ns = depth_views(keyframes, depths_m)
+    visit = Visit(read_ply(folder / MAP), objects, views, times_ns)
+    return {found.object_id: life_of(visit.points_of(found), views, times_ns) for found in objects}

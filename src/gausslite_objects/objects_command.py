@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,10 +11,11 @@ from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build
 from gausslite.config.program import add_flags
 from gausslite.domain.checks import quote_name
-from gausslite.domain.objects import OrientedBox, TeamObject
+from gausslite.domain.objects import ObjectLandmark, TeamObject
 from gausslite.mission.results import as_text
 from gausslite.wire.security import TlsFiles
-from gausslite_language.mapped_objects import as_json, query, read_folder, select
+from gausslite_objects.life import LifeState
+from gausslite_objects.mapped_objects import MappedObjects, as_json, query, read_folder, select
 
 _NS_PER_S = 1e9
 _EPOCH_TIMES_S = 1e8
@@ -46,13 +46,12 @@ def run(options: argparse.Namespace) -> int:
     place = read_folder(folder) if folder.is_dir() else query(options.place, build(TlsFiles, options).read())
     objects, notes = select(place, options.question)
     notes = (*notes, *place.notes)
-    boxes = [place.box(found) for found in objects]
     if options.json:
-        values = [as_json(*pair) for pair in zip(objects, boxes, strict=True)]
+        values = [as_json(found, place) for found in objects]
         print(as_text({"count": len(objects), "objects": values, "notes": list(notes)}))
     else:
-        for pair in zip(objects, boxes, strict=True):
-            print(_describe(*pair))
+        for found in objects:
+            print(_describe(found, place))
         for note in notes:
             print(f"note: {note}")
         if options.question or not objects:
@@ -69,19 +68,29 @@ def _count(count: int, question: str, known: Sequence[TeamObject]) -> str:
     return f"no object{f' for {quote_name(question)}' if question else ''}{has}"
 
 
-def _describe(team_object: TeamObject, box: OrientedBox | None) -> str:
+def _describe(team_object: TeamObject, place: MappedObjects) -> str:
     landmark = team_object.landmark
-    place = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
-    size = " x ".join(f"{value:.2f}" for value in (landmark.size_m if box is None else box.size_m))
-    turned = "" if box is None else f" turned by {round(math.degrees(box.yaw_rad))} deg"
+    centre = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
+    size = " x ".join(f"{value:.2f}" for value in landmark.size_m)
     seen = "; ".join(
         f"{observer.agent_id} {_span(_time(observer.first_seen_ns), _time(observer.last_seen_ns))}"
         for observer in team_object.observers
     )
     return (
-        f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({place}) m, size {size} m{turned}, "
-        f"confidence {landmark.confidence:.2f}, seen by {seen}"
+        f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({centre}) m, size {size} m, "
+        f"confidence {landmark.confidence:.2f}, seen by {seen}{_state(landmark, place)}"
     )
+
+
+def _state(landmark: ObjectLandmark, place: MappedObjects) -> str:
+    """Return what the views and people say of an object, after a comma; empty for one that is just present."""
+    life = place.lives.get(landmark.object_id)
+    parts = [] if life is None or life.state is LifeState.PRESENT else [str(life.state)]
+    if life is not None and life.absent_ns is not None:
+        parts.append(f"its place last seen empty at {_time(life.absent_ns)}")
+    parts += ["pinned"] if landmark.object_id in place.edited.pinned else []
+    parts += [f"note of {note}" for note in place.edited.notes.get(landmark.object_id, ())]
+    return "".join(f", {part}" for part in parts)
 
 
 def _span(first: str, last: str) -> str:

@@ -1,0 +1,101 @@
+"""Edits of objects: durable, attributed, undoable, carried to the next map, and stronger than later detections."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_folders import MUG, write_run
+
+from gausslite.cli.main import main
+from gausslite.codec.json import object_as_json, object_from_json
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.pose import transform_of
+from gausslite_objects.edits import CARRIED, Edit, EditedObjects, EditKind, apply_edits, edits_as_json, read_edits
+
+FOUND = object_from_json(MUG)
+
+
+def _edited(run: Path, *found: ObjectLandmark) -> EditedObjects:
+    return apply_edits(found, read_edits(run))
+
+
+def _edit(run: Path, *words: str) -> None:
+    assert main(["edit", str(run), *words, "--author", "ann"]) == 0
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """Return a run that found a mug."""
+    return write_run(tmp_path / "run")
+
+
+def test_an_edit_wins_over_later_detections_until_it_is_undone(run: Path) -> None:
+    _edit(run, "delete", FOUND.object_id)
+    again = replace(FOUND, object_id="mug-7", confidence=0.99)
+    elsewhere = replace(FOUND, object_id="mug-8", centroid_m=(5.0, 5.0, 5.0))
+    assert _edited(run, again, elsewhere).objects == (elsewhere,)
+    _edit(run, "undo", "1")
+    assert _edited(run, again).objects == (again,)
+    _edit(run, "undo", "2")
+    assert _edited(run, again).objects == ()
+
+
+def test_a_renamed_object_has_its_new_name_for_later_edits(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _edit(run, "rename", FOUND.object_id, "cup")
+    _edit(run, "note", FOUND.object_id, "the blue one")
+    capsys.readouterr()
+    assert main(["objects", str(run), "--json"]) == 0
+    [cup] = json.loads(capsys.readouterr().out)["objects"]
+    assert (cup["noun"], cup["notes"]) == ("cup", ["ann: the blue one"])
+    assert main(["objects", str(run)]) == 0
+    assert capsys.readouterr().out.endswith(", note of ann: the blue one\n")
+    assert main(["edit", str(run), "list"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == f"1: rename \"{FOUND.object_id}\" as 'cup', by ann"
+
+
+def test_a_pinned_object_stays_and_merged_ones_are_one(run: Path) -> None:
+    _edit(run, "pin", FOUND.object_id)
+    edited = _edited(run)
+    assert ([found.centroid_m for found in edited.objects], len(edited.pinned)) == ([FOUND.centroid_m], 1)
+    assert _edited(run, FOUND).objects == (FOUND,)
+    half = replace(FOUND, object_id="mug-2").moved(transform_of(np.array([5.0, 5.0, 5.0, 0.0, 0.0, 0.0])))
+    merge = Edit(EditKind.MERGE, "ann", 1, FOUND, half.object_id, half)
+    [merged] = apply_edits([FOUND, replace(half, confidence=1.0)], [merge]).objects
+    assert (merged.object_id, merged.confidence) == (FOUND.object_id, 1.0)
+
+
+def test_a_run_that_continues_an_edited_map_carries_its_edits(run: Path, tmp_path: Path) -> None:
+    _edit(run, "delete", FOUND.object_id)
+    following = write_run(tmp_path / "next", **{CARRIED: edits_as_json(read_edits(run))})
+    assert read_edits(following) == read_edits(run)
+    _edit(following, "undo", "1")
+    assert (len(read_edits(following)), len(read_edits(run))) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("delete", "sofa-1"), "object: expected one of"),
+        (("rename", FOUND.object_id), "expected a value, got none"),
+        (("rename", FOUND.object_id, " "), "rename: expected a text"),
+        (("merge", FOUND.object_id, "sofa-1"), "object: expected one of"),
+        (("undo", "1"), "undo: expected the number of an edit, 1 to 0"),
+    ],
+)
+def test_an_edit_of_nothing_is_refused(
+    run: Path, words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["edit", str(run), *words]) == 2
+    assert expected in capsys.readouterr().err
+    assert read_edits(run) == ()
+
+
+def test_a_damaged_file_of_edits_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for content in ("{", '{"edits": 5}', json.dumps({"edits": [{"kind": "explode", "target": object_as_json(FOUND)}]})):
+        (run / "object_edits.json").write_text(content)
+        assert main(["edit", str(run), "list"]) == 2
+        assert "object_edits.json: expected the edits of objects" in capsys.readouterr().err
