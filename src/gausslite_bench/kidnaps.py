@@ -162,23 +162,27 @@ def _is_wrong(T: Poses, T_true: Poses) -> bool:
     return translation_m(T, T_true) > _WRONG_M or rotation_angle_deg(T, T_true) > _WRONG_DEG
 
 
-def _after_event(mission: TaskMapper, odometry: Frames, true: Frames, is_known: bool) -> dict[str, Any]:
-    """Map the frames after an event; return when it was noticed, when the robot was found, and what is wrong."""
+def _after_event(
+    mission: TaskMapper, odometry: Frames, true: Frames | None, monitor: _TimedMonitor | None
+) -> dict[str, Any]:
+    """Map the frames after an event; return when it was noticed, when the robot was found, and what is wrong.
+
+    true: the frames at their own poses; None of a place that the map does not have.
+    """
     noticed = found = None
     wrong_frames = wrong_gaussians = mapped = 0
     gaussians = len(mission.gaussians())
-    for i, (frame, own) in enumerate(zip(odometry, true, strict=True)):
-        outcome = mission.process(frame)
-        correction = mission.poses.latest()
-        if outcome.localisation is not LocalisationState.TRACKED and noticed is None:
-            noticed = i
+    for i, frame in enumerate(odometry):
+        outcome, correction = mission.process(frame), mission.poses.latest()
+        is_noticed = outcome.localisation is not LocalisationState.TRACKED or (monitor is not None and monitor.found)
+        noticed = i if is_noticed and noticed is None else noticed
         if outcome.skipped is None and correction is not None:
-            is_wrong = not is_known or _is_wrong(correction.T_map_odometry @ frame.T_world_camera, own.T_world_camera)
+            T_world_camera = correction.T_map_odometry @ frame.T_world_camera
+            is_wrong = true is None or _is_wrong(T_world_camera, true[i].T_world_camera)
+            mapped += len(outcome.mapped)
             wrong_frames += len(outcome.mapped) * is_wrong
             wrong_gaussians += max(outcome.gaussians - gaussians, 0) * is_wrong
-            mapped += len(outcome.mapped)
-            if not is_wrong and found is None:
-                found = i
+            found = i if found is None and not is_wrong else found
         gaussians = outcome.gaussians
     return {"noticed": noticed, "found": found, "mapped": mapped, "wrong": wrong_frames, "wrong_gs": wrong_gaussians}
 
@@ -199,7 +203,7 @@ class _Trials:
         mission = self._mission(monitor)
         outcomes = [mission.process(frame) for frame in self._before]
         watching = 0.0 if monitor is None else monitor.seconds / sum(outcome.timing.seconds for outcome in outcomes)
-        figures = _after_event(mission, self._odometry(event, after), after, is_known)
+        figures = _after_event(mission, self._odometry(event, after), after if is_known else None, monitor)
         true = {frame.index: frame.T_world_camera for frame in after}
         return {
             "event": name,

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame, FrameId
-from gausslite.domain.pose import inverse, orthonormal
+from gausslite.domain.pose import orthonormal, rotation_angle_deg, translation_m
 from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
 from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.seeding import RenderedView
@@ -35,6 +35,7 @@ _AGREEING: Final = {LocalisationState.DOUBTFUL: 1, LocalisationState.LOST: 2}
 _KNOWN_AFTER = 3
 """Frames that must have agreed with the map before one can contradict it: images that never fit the poses are no sign
 of a lost robot."""
+_SAME_POSE_M, _SAME_POSE_DEG = 0.1, 5.0
 _MAX_WAITING = 16
 """Frames with images: 34 MB at 640x480."""
 _CONTRADICTION: Final = "its images contradict the map"
@@ -167,8 +168,12 @@ class FrameMonitor(LocalisationMonitor):
             return None
         T = mapper.poses.T_corrected_odometry
         T_map_now = T_before_now if T is None else T @ T_before_now
-        found = verify(mapper.render, frame, orthonormal(T_map_now @ frame.T_world_camera))
-        return orthonormal(found.T_world_camera @ inverse(frame.T_world_camera)) if found.is_accepted else None
+        placed = orthonormal(T_map_now @ frame.T_world_camera)
+        found = verify(mapper.render, frame, placed)
+        away = translation_m(placed, found.T_world_camera), rotation_angle_deg(placed, found.T_world_camera)
+        # the step by the images has an error of 1 cm, the pose that fits the map best one of 4 cm
+        is_shown = found.is_accepted and away[0] < _SAME_POSE_M and away[1] < _SAME_POSE_DEG
+        return orthonormal(T_map_now) if is_shown else None
 
     def _begin_doubt(self, frame: Frame, doubt: Doubt) -> None:
         self._agreed = self._open = 0

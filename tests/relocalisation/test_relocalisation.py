@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from place_scenes import MapCamera, looking, room
 
+from gausslite.datasets.open import open_source
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.mapping.mapper import GaussianMapper
@@ -172,6 +173,25 @@ def test_a_new_place_is_no_error(camera: MapCamera, gap_s: float) -> None:
     assert np.array_equal(watched.gaussians().means_m, unwatched.gaussians().means_m)
     assert outcomes[-1].skipped is None
     assert watched.localisation is TRACKED
+
+
+HOMES = {
+    "at its own poses": "sim:home?size=160x120",
+    "noisy and blurred": "sim:home-1?size=160x120&noise=2&speed=60&blur=10ms",
+}
+
+
+@pytest.mark.parametrize("address", HOMES.values(), ids=HOMES)
+def test_a_mission_without_an_event_is_mapped_as_if_nobody_watched(address: str) -> None:
+    home = open_source(address)
+    frames = [home.frame(position, (160, 120)) for position in range(0, 40, 2)]
+    watched, unwatched = _mission(), _mission(False)
+    assert {(outcome.skipped, outcome.localisation) for outcome in _process(watched, frames)} == {(None, TRACKED)}
+    _process(unwatched, frames)
+    maps = watched.gaussians(), unwatched.gaussians()
+    for array in fields(maps[0]):
+        assert np.array_equal(*(getattr(gaussians, array.name) for gaussians in maps)), array.name
+    assert watched.notes == unwatched.notes
 
 
 def test_a_restarted_mission_knows_that_it_was_lost_and_is_found(camera: MapCamera) -> None:
