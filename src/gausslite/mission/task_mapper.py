@@ -125,6 +125,7 @@ class TaskMapper:
         self._scheduler = scheduler or FrameScheduler()
         self._publish = publish
         self._tracker, self._monitor = tracker, monitor
+        self._tracked = LocalisationState.TRACKED
         self._detected: DetectedImage | None = None
         self._defects: dict[str, int] = {}
         self._last_image = LastImage()
@@ -167,8 +168,8 @@ class TaskMapper:
 
     @property
     def localisation(self) -> LocalisationState:
-        """Whether the robot's place is known."""
-        return LocalisationState.TRACKED if self._monitor is None else self._monitor.localisation
+        """Whether the robot's place is known, by the monitor, or by tracking."""
+        return self._tracked if self._monitor is None else self._monitor.localisation
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -287,6 +288,7 @@ class TaskMapper:
     def _process_placed(self, frame: Frame) -> FrameOutcome:
         """Process a frame whose place is known."""
         posed = self._track(self._mapper.poses.add_odometry(frame))
+        self._tracked = LocalisationState.LOST if posed is None else LocalisationState.TRACKED
         if posed is None:
             return self._skip(frame, TRACKING_LOST)
         view = FrameView(posed)
