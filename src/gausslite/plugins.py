@@ -38,6 +38,7 @@ class Group(StrEnum):
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
+    TEAM_OBJECTS = "gausslite.team_objects"  # merges the objects that a team's robots report
     REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
     KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
