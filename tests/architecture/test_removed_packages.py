@@ -33,7 +33,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_language": (("gausslite", "parse", "Find the cup"), _MAP, ("gausslite_parser",)),
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
     "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
-    "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
+    "gausslite_calibration": (
+        ("gausslite", "calibrate", SEQUENCE),
+        ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "camera-correction=readout=0.01"),
+    ),
     "gausslite_poses": (
         ("gausslite", "map", SEQUENCE, "--out", "refused", "--poses", "track"),
         ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "pose-prior=0.01,0.5"),
