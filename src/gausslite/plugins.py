@@ -44,6 +44,7 @@ class Group(StrEnum):
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server
+    RUN_RECORDS = "gausslite.run_records"  # writes a file beside the map of a run
     EVALUATORS = "gausslite.evaluators"  # says how well a finished run fits its images
     EXPORTERS = "gausslite.exporters"  # writes a map for another tool; the name is the format
     PAGES = "gausslite.pages"  # shows a run or a service in the browser

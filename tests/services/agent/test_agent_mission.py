@@ -22,7 +22,6 @@ from signals import hangup
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
-from gausslite.codec.run_files import read_map_history
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, StorageError, TaskError
@@ -32,7 +31,6 @@ from gausslite.domain.relevance import BallRegion, Region
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mission.results import locked_folder
 from gausslite.mission.runner import FrameStream
-from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.plugins import Group
@@ -51,6 +49,8 @@ from gausslite_agent.settings import AgentSettings, parse_arguments
 from gausslite_agent.state import EndRequest, MissionState
 from gausslite_language.rules import RuleParser
 from gausslite_view.decoding import stored_keyframe_from_message
+from gausslite_view.map_history import read_map_history
+from gausslite_view.timeline import read_timeline
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
