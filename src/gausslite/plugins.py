@@ -41,6 +41,7 @@ class Group(StrEnum):
     TEAM_OBJECTS = "gausslite.team_objects"  # merges the objects that a team's robots report
     REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
     KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends
+    TEAM_MAPS = "gausslite.team_maps"  # inserts what teammates trained into an agent's map
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server

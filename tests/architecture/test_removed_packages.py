@@ -49,7 +49,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
     "gausslite_recorders": (("gausslite", "map", "../frames", "--out", "refused"),),
     "gausslite_refinement": (),
-    "gausslite_link": (("gausslite", "view", "127.0.0.1:1"),),
+    "gausslite_link": (
+        ("gausslite", "view", "127.0.0.1:1"),
+        ("gausslite_agent", "--listen", "127.0.0.1:0", "--fusion", "127.0.0.1:1", "--set", "team-map=vote"),
+    ),
     "gausslite_render": (("gausslite", "render", "map.ply", "--poses", "a", "--out", "refused"),),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),
