@@ -1,13 +1,15 @@
-"""What a server finds as plug-ins: its store, unless that is memory or a SQLite file, and what serves its figures."""
+"""What a server finds as plug-ins: its store, unless that is memory or a SQLite file, its figures, refinements."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.map_renderer import CreateRasterizer
+from gausslite.fusion.refinement import RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements
@@ -34,6 +36,26 @@ MetricsServer = Callable[[str, FindEngine, Acknowledgements, FindCounts | None],
 
 Raises InvalidInputError for another address, UnavailableError if it is in use.
 """
+
+
+class Refiner(Protocol):
+    """Refines a server's fused map, one refinement at a time."""
+
+    def run(self, engine: FusionEngine, settings: RefineSettings) -> AsyncIterator[RefineProgress]:
+        """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
+
+        Raises QuotaError if another refinement runs or the map exceeds max_gaussians, InvalidInputError if no keyframe
+        agrees with the map.
+        """
+        ...
+
+    def close(self) -> None:
+        """Wait until the last refinement has ended after its cancellation."""
+        ...
+
+
+OpenRefiner = Callable[[CreateRasterizer], Refiner]
+"""The default of the group gausslite.refiners."""
 
 
 class Share(Protocol):
