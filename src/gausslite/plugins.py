@@ -40,7 +40,7 @@ class Group(StrEnum):
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     TEAM_OBJECTS = "gausslite.team_objects"  # merges the objects that a team's robots report
     REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
-    KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends
+    KEYFRAME_UPLOADS = "gausslite.keyframe_uploads"  # chooses and sends the keyframes of a robot
     TEAM_MAPS = "gausslite.team_maps"  # inserts what teammates trained into an agent's map
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments

@@ -190,7 +190,7 @@ def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
 def test_without_a_plug_in_that_selects_keyframes_none_are_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    register(monkeypatch, Group.KEYFRAME_SELECTIONS)
+    register(monkeypatch, Group.KEYFRAME_UPLOADS)
     options = settings(tmp_path, "--set", "handover=true", "--fusion", "localhost:1")
     with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
         mission.run(stream_of(Wall(), options))
