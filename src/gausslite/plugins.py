@@ -39,6 +39,8 @@ class Group(StrEnum):
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     TEAM_OBJECTS = "gausslite.team_objects"  # merges the objects that a team's robots report
+    MAP_RENDERERS = "gausslite.map_renderers"  # renders the fused map from any pose
+    MIGRATIONS = "gausslite.migrations"  # the steps that bring a store of an earlier schema forward
     REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
     KEYFRAME_UPLOADS = "gausslite.keyframe_uploads"  # chooses and sends the keyframes of a robot
     TEAM_MAPS = "gausslite.team_maps"  # inserts what teammates trained into an agent's map

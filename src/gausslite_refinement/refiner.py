@@ -13,8 +13,7 @@ from threading import Event
 
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.map_renderer import CreateRasterizer
-from gausslite.fusion.refinement import RefineProgress, RefineSettings
+from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
 from gausslite.wire.views import ChangeNotifier
 from gausslite_refinement.refinement import Refinement
 

@@ -16,8 +16,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaErro
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.limits import MissionConfig, SessionRecord
-from gausslite.fusion.map_renderer import CreateRasterizer, MapRenderer
-from gausslite.fusion.refinement import RefineSettings
+from gausslite.fusion.refinement import CreateRasterizer, RefineSettings
 from gausslite.plugins import Group, load
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
@@ -30,7 +29,7 @@ from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server import messages
 from gausslite_fusion_server.contributions import Acknowledger, StoredCount
-from gausslite_fusion_server.stores import OpenRefiner, Refiner
+from gausslite_fusion_server.stores import MapRenderer, OpenRefiner, OpenRenderer, Refiner
 from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
 _Message = TypeVar("_Message")
@@ -106,6 +105,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self.engine = engine
         self._refine, self._create_rasterizer = refine, create_rasterizer
         self._refiner: Refiner | None = None
+        self._renderer: MapRenderer | None = None
         self._workers = WorkerPool("fusion server", _WORKERS, _MAX_WAITING)
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
@@ -117,7 +117,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._aligning: asyncio.Task[None] | None = None
         self._slices: asyncio.Task[None] | None = None
         self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
-        self._renderer = MapRenderer(engine.maps, create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
         self._rejections = RejectionLog(_log)
@@ -339,6 +338,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         layer = messages.layer_from_message(request.layer)
 
         def work() -> pb.RenderFusedViewResponse:
+            if self._renderer is None:
+                create: OpenRenderer = load(Group.MAP_RENDERERS, purpose="views of the fused map")
+                self._renderer = create(self.engine.maps, self._create_rasterizer)
             rendering, revision = self._renderer.render(camera, T_world_camera, layer)
             return pb.RenderFusedViewResponse(**view_to_pngs(camera, rendering), revision=revision)
 

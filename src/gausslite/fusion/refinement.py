@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Int64
@@ -14,6 +14,10 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
+from gausslite.render.rasterizer import Rasterizer
+
+CreateRasterizer = Callable[[], Rasterizer]
+"""Creates the rasterizer when it is needed: most servers need no kernels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
