@@ -39,11 +39,16 @@ class Group(StrEnum):
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     MONITORS = "gausslite.monitors"  # judges whether a robot is where its odometry says, and finds a lost one
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
+    TEAM_OBJECTS = "gausslite.team_objects"  # merges the objects that a team's robots report
+    MAP_RENDERERS = "gausslite.map_renderers"  # renders the fused map from any pose
+    MIGRATIONS = "gausslite.migrations"  # the steps that bring a store of an earlier schema forward
     REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
-    KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends
+    KEYFRAME_UPLOADS = "gausslite.keyframe_uploads"  # chooses and sends the keyframes of a robot
+    TEAM_MAPS = "gausslite.team_maps"  # inserts what teammates trained into an agent's map
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server
+    RUN_RECORDS = "gausslite.run_records"  # writes a file beside the map of a run
     EVALUATORS = "gausslite.evaluators"  # says how well a finished run fits its images
     EXPORTERS = "gausslite.exporters"  # writes a map for another tool; the name is the format
     PAGES = "gausslite.pages"  # shows a run or a service in the browser

@@ -1,1 +1,1 @@
-"""Estimates of what a recording does not state: depth registration, pose error and exposure error."""
+"""Images without lens and shutter, and estimates of what a recording does not state: registration, errors of poses."""

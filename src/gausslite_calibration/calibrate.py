@@ -13,14 +13,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
+
 from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
-from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import Lens
+from gausslite.domain.camera import CameraMotion, Lens
 from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import Twist
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite_calibration.camera_estimate import estimate_camera
 from gausslite_calibration.consistency import Contradiction, find_contradiction
+from gausslite_calibration.corrected import CorrectedSource, UndistortedColourSource, ideal_camera, undistort_frame
 from gausslite_calibration.depth_registration import find_registration
 from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
 from gausslite_calibration.registered import RegisteredSource
@@ -91,6 +95,25 @@ def contradictions(source: Source) -> tuple[str, ...]:
         found = find_contradiction(source)
         return () if found is None else (str(found),)
     return ()
+
+
+def undistorted_colour(source: Source) -> UndistortedColourSource:
+    """Return a source with the lens of its colour camera removed from colour alone."""
+    return UndistortedColourSource(source)
+
+
+def live_frame(frame: Frame, lens: Lens | None) -> Frame:
+    """Return the frame without lens distortion; its motion states rolling shutter and blur of the returned image.
+
+    lens: that of the recorded image, None for a pinhole. Raises InvalidInputError for a lens without a usable pinhole
+    camera.
+    """
+    motion = frame.motion or CameraMotion(Twist(np.zeros(3), np.zeros(3)))
+    correction = CameraCorrection(lens, motion.readout_s, exposure_s=motion.exposure_s)
+    if correction.is_identity:
+        return frame
+    ideal = ideal_camera(frame.camera, CameraCorrection(lens), 0.0)
+    return undistort_frame(frame, correction, ideal, motion.twist)
 
 
 def _contradiction(source: Source, force: bool) -> Contradiction | None:

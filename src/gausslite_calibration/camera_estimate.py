@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy import ndarray
 
-from gausslite.datasets.corrected import ideal_camera
 from gausslite.datasets.source import Source, downscaled_size
 from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import CameraCorrection
+from gausslite_calibration.corrected import ideal_camera
 from gausslite_calibration.exposure_time import estimate_exposure_time
 from gausslite_calibration.joint_camera_fit import CameraFit, fit_camera
 from gausslite_calibration.moving_pairs import MovingPairs, PairError

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.source import Source, downscaled_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.recording import CameraCorrection
+from gausslite_calibration.corrected import CorrectedSource
 from gausslite_calibration.depth_consistency import find_other_depth
 from gausslite_calibration.rig_fit import REGISTERED, UNREGISTERED, PointMotion, fit_intrinsics, fit_mount
 from gausslite_poses.features import RelativePose, detect_features, relative_pose

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.datasets.corrected import correct_frame
 from gausslite.datasets.source import Source, capped_size, usable_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, Twist, inverse
 from gausslite.domain.recording import CameraCorrection
+from gausslite_calibration.corrected import correct_frame
 from gausslite_calibration.moving_pairs import warp_into
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.datasets.corrected import correct_frame, recorded_pixels
 from gausslite.domain.camera import Lens, LensModel, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist, inverse, transform_of, twist_of
 from gausslite.domain.recording import CameraCorrection
+from gausslite_calibration.corrected import correct_frame, recorded_pixels
 from gausslite_calibration.moving_pairs import MIN_COMPARABLE_SHARE, FrameWarp, MovingPairs
 from gausslite_poses.least_squares import NormalEquations, robust_weights
 from gausslite_poses.photometric import (

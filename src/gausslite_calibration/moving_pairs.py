@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.datasets.corrected import correct_frame
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, usable_frames
 from gausslite.domain.camera import back_project
@@ -23,6 +22,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, transform_points, twist_of
 from gausslite.domain.recording import HANDHELD_PRIOR, CameraCorrection
 from gausslite.render.rasterizer import NEAR_M, Rendering
+from gausslite_calibration.corrected import correct_frame
 from gausslite_calibration.registered import register_depth
 from gausslite_poses.photometric import (
     MAX_PIXELS,

@@ -14,13 +14,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy import ndarray
 
-from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.source import Source, downscaled_size
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, twist_of
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.render.rasterizer import Rendering
+from gausslite_calibration.corrected import CorrectedSource
 from gausslite_calibration.moving_pairs import warp_into
 from gausslite_poses.exposure import fit_exposure
 from gausslite_poses.photometric import comparable_pixels, fit_pose

@@ -38,7 +38,6 @@ from gausslite_cluster.regions import Owners
 from gausslite_cluster.shared_watch import SharedRevisions, SharedWatch
 from gausslite_fusion_server.contributions import Acknowledger
 from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message
-from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
 from gausslite_fusion_server.settings import ServerSettings
 from gausslite_fusion_server.stores import MessageCounts
@@ -371,9 +370,7 @@ async def open_share(settings: ServerSettings, url: str, peer_address: str) -> A
     _log.info("server %s: shares its mission; frames of agents are used as they are (trust)", peer_address)
 
     def create_servicer(engine: FusionEngine) -> FusionServicer:
-        return FusionServicer(
-            engine, RefinementWorker(settings.refine, partial(choose_rasterizer, settings.rasterizer))
-        )
+        return FusionServicer(engine, settings.refine, partial(choose_rasterizer, settings.rasterizer))
 
     # names are fixed, and frames are trusted
     agreed = settings.fusion.mission_config.with_default_names()

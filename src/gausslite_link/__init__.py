@@ -1,1 +1,1 @@
-"""What a program beside an agent or a server keeps running: a link for frames and tasks, and a follower of its map."""
+"""Links between the programs of a team: frames and tasks to an agent, a service's map, and the team's in an agent."""

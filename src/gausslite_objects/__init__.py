@@ -1,1 +1,1 @@
-"""The memory of objects: their life over views and missions, what changed between two visits, and people's edits."""
+"""The memory of objects: their life over views and missions, changes between visits, edits, and a team's objects."""

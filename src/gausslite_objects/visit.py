@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
-from gausslite.codec.run_files import KeyframeView, read_keyframe_depths
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import back_project
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import without_depth_edges
@@ -20,6 +20,7 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.free_space import REDUCED_WIDTH_PX, DepthView, view_counts
+from gausslite_objects.keyframe_depths import read_keyframe_depths
 
 GRID = VoxelGrid(0.05)
 _MAX_DEPTH_M = 5.0

@@ -19,7 +19,6 @@ from numpy import ndarray
 from gausslite.domain.camera import back_project
 from gausslite.domain.pose import transform_points
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.keyframe_selection import MIN_GAIN_SHARE, KeyframeAddition, SelectedKeyframe
 from gausslite.mapping.keyframes import Keyframe
 
 _ROI_VALUE, _BACKGROUND_VALUE = 160.0, 40.0
@@ -29,6 +28,30 @@ _BACKGROUND_VOXELS = 4
 _STRIDE_PX = 4
 _EXCHANGE_FACTOR = 1.5
 _MOVED_M, _TURNED_RAD = 0.005, 0.003
+_MIN_GAIN_SHARE = 0.25
+"""Share of a keyframe's own coverage that must be new during a mission."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeAddition:
+    """A keyframe to add to the selection and to send.
+
+    coverage: what it sees, for a restart. gain: value of what it adds, in units of kappa. replaced: index of the
+    keyframe that it replaces, or None.
+    """
+
+    keyframe: Keyframe
+    coverage: bytes
+    gain: float
+    replaced: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SelectedKeyframe:
+    """A keyframe selected before a restart, and the pose with which it was sent."""
+
+    coverage: bytes
+    T_world_camera: Float64[ndarray, "4 4"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +109,7 @@ class KeyframeSelection:
         for index, earlier in (selected or {}).items():
             self._add(index, Coverage.from_bytes(earlier.coverage), earlier.T_world_camera)
 
-    def select(self, keyframe: Keyframe, min_gain_share: float = MIN_GAIN_SHARE) -> KeyframeAddition | None:
+    def select(self, keyframe: Keyframe, min_gain_share: float = _MIN_GAIN_SHARE) -> KeyframeAddition | None:
         """Select the keyframe if it adds enough, or if its pose has been corrected since it was selected."""
         index = keyframe.frame.index
         earlier = self._selected.get(index)

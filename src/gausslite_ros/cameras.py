@@ -12,7 +12,6 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera
-from gausslite.datasets.corrected import undistort_colour, undistort_depth
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, MissingPluginError
@@ -64,25 +63,19 @@ class RgbdCamera:
         _require_size(f"{location}: depth", depth_m, depth_camera.camera)
         if self.depth is None:
             return RgbdImage(rgb, depth_m, self.camera)
+        # most cameras align depth themselves
+        try:
+            from gausslite_calibration import corrected, registered
+        except ModuleNotFoundError as error:
+            raise MissingPluginError(
+                "depth that is not aligned to colour: needs the package gausslite_calibration, which is not installed"
+            ) from error
         if self.colour.lens is not None:
-            rgb = undistort_colour(rgb, self.camera, self.colour.lens)
+            rgb = corrected.undistort_colour(rgb, self.camera, self.colour.lens)
         if self.depth.lens is not None:
-            depth_m = undistort_depth(depth_m, self.depth.camera, self.depth.lens)
-        registered_m = _register(depth_m, self.depth.camera, self.camera, self.T_colour_depth)
+            depth_m = corrected.undistort_depth(depth_m, self.depth.camera, self.depth.lens)
+        registered_m = registered.register_depth(depth_m, self.depth.camera, self.camera, self.T_colour_depth)
         return RgbdImage(rgb, registered_m, self.camera)
-
-
-def _register(
-    depth_m: Float32[ndarray, "h w"], depth_camera: Camera, camera: Camera, T_colour_depth: Float64[ndarray, "4 4"]
-) -> Float32[ndarray, "hc wc"]:
-    # most cameras align depth themselves
-    try:
-        from gausslite_calibration.registered import register_depth
-    except ModuleNotFoundError as error:
-        raise MissingPluginError(
-            "depth that is not aligned to colour: needs the package gausslite_calibration, which is not installed"
-        ) from error
-    return register_depth(depth_m, depth_camera, camera, T_colour_depth)
 
 
 def _require_size(location: str, image: ndarray, camera: Camera) -> None:

@@ -17,11 +17,11 @@ from gausslite.domain.camera import Camera, project
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import CameraView, DetectedImage
-from gausslite.domain.state import EvenHistory
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import KEYFRAME_JPEG_QUALITY, decode_colour, encode_colour
 from gausslite_view.contents import AgentPath, ViewContents, object_boxes
 from gausslite_view.decoding import StoredKeyframe, stored_keyframe_from_message
+from gausslite_view.even_history import EvenHistory
 from gausslite_view.map_page import MapPage
 
 _REGION_RGB, _BOX_RGB = (255, 60, 60), (60, 230, 90)

@@ -12,7 +12,6 @@ import numpy as np
 import viser
 
 from gausslite.domain.errors import GaussLiteError
-from gausslite.domain.gaussians import choose_gaussians
 from gausslite.domain.task import TaskGraph
 from gausslite_view.contents import (
     DEFAULT_LIMIT,
@@ -24,6 +23,7 @@ from gausslite_view.contents import (
     legend_of,
     start_view,
 )
+from gausslite_view.important_gaussians import choose_gaussians
 from gausslite_view.levels import SplatLevels, Splats
 from gausslite_view.local_server import LOOPBACK, LocalServer
 from gausslite_view.markers import SceneMarkers

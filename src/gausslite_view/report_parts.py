@@ -12,11 +12,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import read_ply, read_world_frame
-from gausslite.codec.run_files import ViewImage
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_evaluation, read_report
-from gausslite.mission.schedule import read_timeline
 from gausslite.process import print_message, size_text
 from gausslite_evaluation.compare import TEAM_MAP
 from gausslite_evaluation.lpips import NAME as LPIPS_NAME
@@ -24,7 +22,8 @@ from gausslite_view.contents import ViewContents, object_boxes, with_agents
 from gausslite_view.oriented_box import OrientedBox
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
-from gausslite_view.view_images import read_view_images
+from gausslite_view.timeline import read_timeline
+from gausslite_view.view_images import ViewImage, read_view_images
 
 _MAP, _PICTURES = "map.ply", "pictures"
 _FUSED_MAPS = ("concatenation", "vote", "refine")

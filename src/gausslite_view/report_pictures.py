@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.codec.run_files import KeyframeView, ViewImage
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
@@ -32,6 +32,7 @@ from gausslite_view.contents import ColourMode, ViewContents, colours_of, legend
 from gausslite_view.oriented_box import OrientedBox
 from gausslite_view.report_elements import element, picture, picture_url, styled
 from gausslite_view.report_parts import RunResults
+from gausslite_view.view_images import ViewImage
 
 _WIDTH_PX, _MAX_HEIGHT_PX = 480, 640
 _MARGIN_M = 0.3

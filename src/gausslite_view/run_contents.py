@@ -11,13 +11,14 @@ import numpy as np
 
 from gausslite.codec.json import object_from_json
 from gausslite.codec.ply import read_ply
-from gausslite.codec.run_files import MapSnapshot, read_keyframe_views, read_map_history
+from gausslite.codec.run_files import read_keyframe_views
 from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import TRAJECTORY, read_report
 from gausslite.process import print_message
 from gausslite_view.contents import NO_AGENT, ViewContents
+from gausslite_view.map_history import MapSnapshot, read_map_history
 from gausslite_view.time_scrub import PastMap
 
 _MAP = "map.ply"

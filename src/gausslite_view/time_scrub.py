@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from gausslite.codec.run_files import MAX_GAUSSIANS
-from gausslite.domain.gaussians import choose_gaussians
-from gausslite.domain.state import EvenHistory
 from gausslite_view.contents import ViewContents
+from gausslite_view.even_history import EvenHistory
+from gausslite_view.important_gaussians import choose_gaussians
+from gausslite_view.map_history import MAX_GAUSSIANS
 
 _MAX_STATES = 64
 """Earlier maps: 91 MB at most, with MAX_GAUSSIANS each."""

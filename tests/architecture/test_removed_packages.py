@@ -33,7 +33,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_language": (("gausslite", "parse", "Find the cup"), _MAP, ("gausslite_parser",)),
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
     "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
-    "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
+    "gausslite_calibration": (
+        ("gausslite", "calibrate", SEQUENCE),
+        ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "camera-correction=readout=0.01"),
+    ),
     "gausslite_poses": (
         ("gausslite", "map", SEQUENCE, "--out", "refused", "--poses", "track"),
         ("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "pose-prior=0.01,0.5"),
@@ -47,7 +50,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
     "gausslite_recorders": (("gausslite", "map", "../frames", "--out", "refused"),),
     "gausslite_refinement": (),
-    "gausslite_link": (("gausslite", "view", "127.0.0.1:1"),),
+    "gausslite_link": (
+        ("gausslite", "view", "127.0.0.1:1"),
+        ("gausslite_agent", "--listen", "127.0.0.1:0", "--fusion", "127.0.0.1:1", "--set", "team-map=vote"),
+    ),
     "gausslite_render": (("gausslite", "render", "map.ply", "--poses", "a", "--out", "refused"),),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),

@@ -17,7 +17,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply
-from gausslite.codec.run_files import read_map_history
+from gausslite_view.map_history import read_map_history
 
 HOME = "sim:home?seed=0&trajectory=0&frames=12"
 SMALL = ("--size", "160x120", "--max-gaussians", "6000", "--iterations", "4")

@@ -7,9 +7,8 @@ import pytest
 from fusion_running import CAMERA, GRID, frame
 
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.keyframe_selection import SelectedKeyframe
 from gausslite.mapping.keyframes import Keyframe
-from gausslite_refinement.keyframe_selection import Coverage, KeyframeSelection
+from gausslite_refinement.keyframe_selection import Coverage, KeyframeSelection, SelectedKeyframe
 
 
 def pose(x_m: float, yaw_deg: float = 0.0) -> np.ndarray:

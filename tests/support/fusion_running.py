@@ -44,7 +44,6 @@ from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.security import Tls
-from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 
 GRID = VoxelGrid(0.10)
@@ -105,7 +104,7 @@ def fusion_server(
     settings = settings or FusionSettings(grid=GRID)
     engine = FusionEngine(store or SqliteStore(), settings, decode_keyframe=decode_frame, aligner=aligner)
     settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
-    servicer = FusionServicer(engine, RefinementWorker(settings_of_refinement, ReferenceRasterizer))
+    servicer = FusionServicer(engine, settings_of_refinement, ReferenceRasterizer)
     loops = []
 
     def register(server: grpc.aio.Server) -> None:

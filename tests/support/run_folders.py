@@ -10,9 +10,10 @@ import numpy as np
 from sample_gaussians import plain_gaussians
 
 from gausslite.codec.ply import write_ply
-from gausslite.codec.run_files import KeyframeView, ViewImage, write_keyframe_views, write_view_images
+from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.datasets.folder import format_pose_rows
 from gausslite.domain.camera import Camera
+from gausslite_view.view_images import ViewImage, write_view_images
 
 WIDTH, HEIGHT = 64, 48
 MUG = {

@@ -18,10 +18,11 @@ from run_folders import write_team
 from sample_gaussians import plain_gaussians
 
 from gausslite.codec.ply import write_ply
-from gausslite.codec.run_files import KeyframeView, MapSnapshot, write_keyframe_views, write_map_history
+from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite_view.contents import ColourMode, ViewContents, colours_of
+from gausslite_view.map_history import MapSnapshot, write_map_history
 from gausslite_view.oriented_box import OrientedBox
 from gausslite_view.run_contents import read_contents, read_past
 

@@ -11,7 +11,7 @@ from tiny_sequences import HEIGHT, WIDTH, WITHOUT_ESTIMATES, write_seven_scenes
 
 from gausslite.cli.main import main
 from gausslite.codec.run_files import read_keyframe_views
-from gausslite.mission.schedule import read_timeline
+from gausslite_view.timeline import read_timeline
 from gausslite_view.view_images import read_view_images
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")

@@ -27,6 +27,7 @@ from gausslite.domain.pose import PoseCorrection
 from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker, open_monitor
@@ -34,7 +35,7 @@ from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.prior_map import PriorMap
-from gausslite.mission.schedule import MapRecorder, Timeline
+from gausslite.mission.run_records import RunRecords
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.pointing import pointed_masks
@@ -106,7 +107,7 @@ class MappingWorker:
         self._unpublished = empty_batch()
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
-        self._timeline, self._recorder = Timeline(), MapRecorder()
+        self._records = RunRecords()
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
@@ -176,10 +177,9 @@ class MappingWorker:
         return time.monotonic() - start_s
 
     @_on_worker
-    def write_history(self, folder: Path) -> None:
-        """Write frames.csv and map_history.safetensors, since the program's start. Raises StorageError."""
-        self._timeline.write(folder)
-        self._recorder.write(folder)
+    def write_records(self, folder: Path, keyframes: Sequence[Keyframe]) -> None:
+        """Write what packages have recorded since the program's start. Raises StorageError."""
+        self._records.write(folder, keyframes)
 
     @_on_worker
     def camera_view(self) -> CameraView | None:
@@ -344,8 +344,7 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.enqueue_newest(self._mapper.keyframes())
-        self._timeline.add(outcome)
-        self._recorder.record(self._mapper.poses, self._mapper.gaussians)
+        self._records.add(outcome, self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
         self._count(report, outcome)
         self._on_change()

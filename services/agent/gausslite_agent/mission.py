@@ -356,7 +356,7 @@ class AgentMission:
         motion = None if prior is None else prior.motion
         self._worker.run(lambda mapper: write_poses(folder, mapper.poses, motion)).result()
         write_keyframes(folder, keyframes)
-        self._worker.write_history(folder).result()
+        self._worker.write_records(folder, keyframes).result()
 
     def _send_all(self, uplink: Uplink, request: EndRequest) -> None:
         """Send the rest of the region and the keyframes and, for a handover, the rest of the map, within one time."""

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
+from typing import Protocol
 
 from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import NONE
@@ -25,6 +26,7 @@ from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.pages import load_pages
+from gausslite.plugins import Group, load
 from gausslite.process import ROBOT_LOST
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.run_service import run_service
@@ -38,11 +40,22 @@ from gausslite_agent.mission import NO_DETECTOR, AgentMission
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.state import SavedMission
-from gausslite_agent.team_map import TeamMapFollower
 
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 30.0
 _RETRY_S = 0.5
+
+
+class TeamMap(Protocol):
+    """Inserts what teammates trained into an agent's map, on a thread of its own."""
+
+    def close(self) -> None:
+        """End the thread and the connection."""
+        ...
+
+
+OpenTeamMap = Callable[[FusionClient, str, str, MappingWorker], TeamMap]
+"""The default of `gausslite.team_maps`, called with an own client, the agent's id, the layer to follow, and the map."""
 
 
 class WaitingParser:
@@ -189,6 +202,8 @@ def _require_usable(settings: AgentSettings) -> None:
     RunPlan(settings.mission, settings.perception, prior=settings.prior).check(settings.out)
     if settings.state is not None:
         prepare_file(settings.state)
+    if settings.link.team_map != NONE:
+        load(Group.TEAM_MAPS, purpose="team-map")
 
 
 def _read_saved(settings: AgentSettings) -> SavedMission | None:
@@ -264,9 +279,9 @@ def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: Exit
     link = settings.link
     if link.fusion is None or link.team_map == NONE:
         return
+    follow: OpenTeamMap = load(Group.TEAM_MAPS)
     client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
-    follower = TeamMapFollower(client, settings.agent_id, link.team_map, worker)
-    stack.callback(follower.close)
+    stack.callback(follow(client, settings.agent_id, link.team_map, worker).close)
 
 
 def _keyframe_upload(link: ConnectionSettings, uplink: Uplink | None) -> KeyframeUpload | None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gausslite.codec.subset_codec import split_batch
+from gausslite.datasets.calibration import open_calibrator
 from gausslite.domain.errors import InvalidInputError, MismatchError, RevisionGoneError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -28,7 +29,6 @@ from gausslite.domain.voxels import (
     tombstones,
 )
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mission.runner import correct_live_frame
 from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
@@ -293,4 +293,4 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
 def _decode_frame(request: pb.IngestFramesRequest) -> Frame:
     """Return the frame without lens distortion and rolling shutter. Raises InvalidInputError and subclasses."""
-    return correct_live_frame(*live_frame_from_message(request.frame))
+    return open_calibrator().live_frame(*live_frame_from_message(request.frame))

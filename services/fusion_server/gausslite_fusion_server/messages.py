@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import tempfile
 from collections.abc import AsyncIterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import google_crc32c
 import numpy as np
@@ -13,14 +13,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import ply_bytes
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
-from gausslite.fusion.limits import SessionRecord
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, SessionRecord
+from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
@@ -61,6 +62,18 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
     engine.keyframes.add(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES], request.session_id)
+
+
+def refine_settings(default: RefineSettings, request: pb.RefineFusedMapRequest) -> RefineSettings:
+    """Return the settings of a refinement: those of the server where the request states none. Raises QuotaError."""
+    if request.iterations > MAX_REFINE_ITERATIONS:
+        raise QuotaError(f"refine iterations: expected at most {MAX_REFINE_ITERATIONS}, got {request.iterations}")
+    return replace(
+        default,
+        iterations=request.iterations or default.iterations,
+        max_gaussians=min(request.max_gaussians or default.max_gaussians, default.max_gaussians),
+        seed=request.seed,
+    )
 
 
 def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> VoxelBatch:

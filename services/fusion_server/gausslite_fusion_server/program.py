@@ -22,7 +22,6 @@ from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
-from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import PROGRAM, FrameUse, ServerSettings, parse_arguments
 from gausslite_fusion_server.stores import FindCounts, FindEngine, MetricsServer, database_of, open_store
@@ -80,8 +79,7 @@ async def _serve(settings: ServerSettings) -> None:
     with contextlib.closing(open_store(settings)) as store:
         aligner = _open_aligner(settings)
         engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, aligner=aligner)
-        refinement = RefinementWorker(settings.refine, partial(choose_rasterizer, settings.rasterizer))
-        servicer = FusionServicer(engine, refinement)
+        servicer = FusionServicer(engine, settings.refine, partial(choose_rasterizer, settings.rasterizer))
         try:
             await _serve_mission(settings, engine, servicer)
         finally:

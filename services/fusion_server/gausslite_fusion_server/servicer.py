@@ -16,7 +16,8 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaErro
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.limits import MissionConfig, SessionRecord
-from gausslite.fusion.map_renderer import MapRenderer
+from gausslite.fusion.refinement import CreateRasterizer, RefineSettings
+from gausslite.plugins import Group, load
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire import convert
@@ -28,7 +29,7 @@ from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server import messages
 from gausslite_fusion_server.contributions import Acknowledger, StoredCount
-from gausslite_fusion_server.refinement_worker import RefinementWorker
+from gausslite_fusion_server.stores import MapRenderer, OpenRefiner, OpenRenderer, Refiner
 from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
 _Message = TypeVar("_Message")
@@ -100,9 +101,11 @@ _Result = TypeVar("_Result")
 class FusionServicer(pb_grpc.FusionServiceServicer):
     """Serves one fused map. All work runs in threads, so that the event loop always answers health checks."""
 
-    def __init__(self, engine: FusionEngine, refinement_worker: RefinementWorker) -> None:
+    def __init__(self, engine: FusionEngine, refine: RefineSettings, create_rasterizer: CreateRasterizer) -> None:
         self.engine = engine
-        self._refinement_worker = refinement_worker
+        self._refine, self._create_rasterizer = refine, create_rasterizer
+        self._refiner: Refiner | None = None
+        self._renderer: MapRenderer | None = None
         self._workers = WorkerPool("fusion server", _WORKERS, _MAX_WAITING)
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
@@ -114,7 +117,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._aligning: asyncio.Task[None] | None = None
         self._slices: asyncio.Task[None] | None = None
         self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
-        self._renderer = MapRenderer(engine.maps, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
         self._rejections = RejectionLog(_log)
@@ -174,7 +176,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         for pool in (self._views, self._exports, self._queries, self._joins, self._keyframes, self._workers):
             pool.close()
         self._committer.shutdown(wait=True)
-        self._refinement_worker.close()
+        if self._refiner is not None:
+            self._refiner.close()
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Join the mission."""
@@ -281,8 +284,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Refine the fused map and report progress; closing the stream cancels the refinement."""
         self._gate.require_open()
         self.engine.members.require_mission(request.mission_id)
+        settings = messages.refine_settings(self._refine, request)
+        if self._refiner is None:
+            create: OpenRefiner = load(Group.REFINERS, purpose="refinement")
+            self._refiner = create(self._create_rasterizer)
         response = pb.RefineFusedMapResponse()
-        async for progress in self._refinement_worker.run(self.engine, request):
+        async for progress in self._refiner.run(self.engine, settings):
             self._gate.require_open()
             response = pb.RefineFusedMapResponse(**asdict(progress))
             yield response
@@ -331,6 +338,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         layer = messages.layer_from_message(request.layer)
 
         def work() -> pb.RenderFusedViewResponse:
+            if self._renderer is None:
+                create: OpenRenderer = load(Group.MAP_RENDERERS, purpose="views of the fused map")
+                self._renderer = create(self.engine.maps, self._create_rasterizer)
             rendering, revision = self._renderer.render(camera, T_world_camera, layer)
             return pb.RenderFusedViewResponse(**view_to_pngs(camera, rendering), revision=revision)
 

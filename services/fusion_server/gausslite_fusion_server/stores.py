@@ -1,17 +1,24 @@
-"""What a server finds as plug-ins: its store, unless that is memory or a SQLite file, and what serves its figures."""
+"""What a server finds as plug-ins: databases, figures for monitors, views and refinements of its map."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
+from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements
 from gausslite.plugins import Group, load
+from gausslite.render.rasterizer import Rendering
 from gausslite.wire.server import Service
 from gausslite_fusion_server.settings import ServerSettings
 
@@ -34,6 +41,40 @@ MetricsServer = Callable[[str, FindEngine, Acknowledgements, FindCounts | None],
 
 Raises InvalidInputError for another address, UnavailableError if it is in use.
 """
+
+
+class MapRenderer(Protocol):
+    """Renders the fused map from any pose, on one thread."""
+
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer, /
+    ) -> tuple[Rendering | None, int]:
+        """Return a view of a layer, None of an empty one, and the layer's revision. Raises KernelError."""
+        ...
+
+
+OpenRenderer = Callable[[FusedMapLayers, CreateRasterizer], MapRenderer]
+"""The default of the group gausslite.map_renderers."""
+
+
+class Refiner(Protocol):
+    """Refines a server's fused map, one refinement at a time."""
+
+    def run(self, engine: FusionEngine, settings: RefineSettings) -> AsyncIterator[RefineProgress]:
+        """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
+
+        Raises QuotaError if another refinement runs or the map exceeds max_gaussians, InvalidInputError if no keyframe
+        agrees with the map.
+        """
+        ...
+
+    def close(self) -> None:
+        """Wait until the last refinement has ended after its cancellation."""
+        ...
+
+
+OpenRefiner = Callable[[CreateRasterizer], Refiner]
+"""The default of the group gausslite.refiners."""
 
 
 class Share(Protocol):

@@ -43,8 +43,9 @@ from gausslite.mission.results import (
     write_poses,
     write_results,
 )
+from gausslite.mission.run_records import RunRecords
 from gausslite.mission.runner import MissionResult
-from gausslite.mission.schedule import MapRecorder, TaskSchedule, Timeline
+from gausslite.mission.schedule import TaskSchedule
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
@@ -222,9 +223,9 @@ def run(options: argparse.Namespace) -> int:
 def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None]) -> int:
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
-        timeline, recorder = Timeline(), MapRecorder()
-        mapped = _map_frames(options, run, draw, timeline, recorder)
-        written = _write_results(options, mapped, timeline, recorder) if mapped.is_worth_keeping else None
+        records = RunRecords()
+        mapped = _map_frames(options, run, draw, records)
+        written = _write_results(options, mapped, records) if mapped.is_worth_keeping else None
     # an early end keeps the map so far; the exit code reports it
     if isinstance(mapped.result.stopped_by, KeyboardInterrupt):
         raise type(mapped.result.stopped_by)(_interrupted_text(options, mapped.result, written))
@@ -241,11 +242,7 @@ def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome
 
 
 def _map_frames(
-    options: argparse.Namespace,
-    run: OpenRun,
-    draw: Callable[[FrameOutcome], None],
-    timeline: Timeline,
-    recorder: MapRecorder,
+    options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None], records: RunRecords
 ) -> MappedRun:
     """Map all frames with a bar. Raises DatasetError if frames exist and none of them can be used."""
     mapper = run.scheduled.mapper
@@ -253,8 +250,7 @@ def _map_frames(
 
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
-            timeline.add(outcome)
-            recorder.record(mapper.poses, mapper.gaussians)
+            records.add(outcome, mapper.poses, mapper.gaussians)
             draw(outcome)
 
         mapped = run.map(print_above_bar, report, options.strict, options.save_state)
@@ -275,10 +271,8 @@ class _Written:
     scores: TrainingFit | None
 
 
-def _write_results(
-    options: argparse.Namespace, mapped: MappedRun, timeline: Timeline, recorder: MapRecorder
-) -> _Written:
-    """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
+def _write_results(options: argparse.Namespace, mapped: MappedRun, records: RunRecords) -> _Written:
+    """Write map.ply, report.json, poses, keyframes, preview.png and the records of packages. Raises StorageError."""
     out, mapper, mission, prior = options.out, mapped.mapper, mapped.run.plan.mission, mapped.run.prior
     keyframes = mapper.keyframes()
     evaluator, missing = _evaluator()
@@ -301,9 +295,8 @@ def _write_results(
     world_frame = default_world_frame(mapped.run.stream.source) if stated is None else str(stated)
     write_results(out, mapped.gaussians, report, world_frame)
     write_poses(out, mapper.poses, None if prior is None else prior.motion)
-    timeline.write(out)
-    recorder.write(out)
     write_keyframes(out, keyframes)
+    records.write(out, keyframes)
     if evaluator is not None and views:
         write_png(out / PREVIEW, evaluator.preview(viewer, views))
     return _Written(report, notes, changes.lines, scores)

@@ -1,4 +1,4 @@
-"""The protocol of what estimates the values that a recording does not state, and the use of a recording without one."""
+"""The protocol of what estimates and corrects a recording's camera and poses, and the use of a recording without it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import MissingPluginError
+from gausslite.domain.frame import Frame
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, load
 
@@ -104,9 +104,21 @@ class Calibrator(Protocol):
         """Return how poses or depth contradict the images, as messages for the operator."""
         ...
 
+    def undistorted_colour(self, source: Source, /) -> Source:
+        """Return a source with the lens of its colour camera removed from colour alone, whose intrinsics it keeps."""
+        ...
+
+    def live_frame(self, frame: Frame, lens: Lens | None, /) -> Frame:
+        """Return the frame without lens distortion; its motion states rolling shutter and blur of the returned image.
+
+        lens: that of the recorded image, None for a pinhole. Raises InvalidInputError for a lens without a usable
+        pinhole camera, MissingPluginError.
+        """
+        ...
+
 
 class StatedOnly:
-    """The Calibrator without a plug-in: corrects images as stated, and returns a note on what nobody states."""
+    """The Calibrator without a plug-in: uses images as recorded, and returns notes on what is not corrected."""
 
     def __init__(self, reason: str) -> None:
         self._reason = reason
@@ -114,16 +126,21 @@ class StatedOnly:
     def calibrate(
         self, source: Source, stated: StatedValues, _report: Callable[[Evidence], None] | None = None
     ) -> Calibration:
-        """Return the source with what is stated. Raises InvalidInputError; MissingPluginError to register depth."""
-        registration = ("registration of depth",) if stated.leaves_registration_open(source) else ()
-        unknown = (*registration, *stated.open_values(source))
+        """Return the source as recorded. Raises MissingPluginError for stated values that would change it.
+
+        The lens that its files state is a note.
+        """
+        of_files = CameraCorrection(source.lens)
         if stated.registration is not None:
             load(Group.CALIBRATORS, purpose="register-depth")
-        correction = stated.correction or CameraCorrection(stated.lens or source.lens)
-        if not correction.is_identity:
-            source = CorrectedSource(source, correction)
-        notes = (f"not estimated: {', '.join(unknown)}; {self._reason}",) if unknown else ()
-        return Calibration(source, None, correction, stated.pose_prior or PoseExposurePrior(), (), notes)
+        if stated.correction not in (None, CameraCorrection(), of_files):
+            load(Group.CALIBRATORS, purpose="camera-correction")
+        registration = ("registration of depth",) if stated.leaves_registration_open(source) else ()
+        unknown = (*registration, *stated.open_values(source))
+        lens = () if of_files.is_identity or stated.correction == CameraCorrection() else (f"the lens {source.lens}",)
+        kinds = (("estimated", unknown), ("corrected", lens))
+        notes = tuple(f"not {kind}: {', '.join(values)}; {self._reason}" for kind, values in kinds if values)
+        return Calibration(source, None, CameraCorrection(), stated.pose_prior or PoseExposurePrior(), (), notes)
 
     def intentions(self, _source: Source, _stated: StatedValues) -> tuple[str, ...]:
         """Return none: nothing is estimated."""
@@ -133,9 +150,19 @@ class StatedOnly:
         """Return none: nothing is compared."""
         return ()
 
+    def undistorted_colour(self, source: Source) -> Source:
+        """Return the source as recorded; `calibrate` has a note on its lens."""
+        return source
+
+    def live_frame(self, frame: Frame, lens: Lens | None) -> Frame:
+        """Return the frame as recorded. Raises MissingPluginError for one with a lens."""
+        if lens is not None:
+            load(Group.CALIBRATORS, purpose="lens of a frame")
+        return frame
+
 
 def open_calibrator() -> Calibrator:
-    """Return the installed calibrator, else one that applies what is stated."""
+    """Return the installed calibrator, else one that uses recordings as they are."""
     try:
         calibrator: Calibrator = load(Group.CALIBRATORS)
     except MissingPluginError as error:

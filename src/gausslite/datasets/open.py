@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 from gausslite.datasets.calibration import StatedValues, open_calibrator
-from gausslite.datasets.corrected import UndistortedColourSource
 from gausslite.datasets.folder import FolderReader
 from gausslite.datasets.source import Source, SourceReader
 from gausslite.datasets.tum import TumSource
@@ -52,7 +51,7 @@ def open_reference(spec: str, depth_registration: DepthRegistration | None = Non
 
 def _registered(source: Source, registration: DepthRegistration | None) -> Source:
     if source.lens is not None and not source.depth_registered:
-        source = UndistortedColourSource(source)
+        source = open_calibrator().undistorted_colour(source)
     if registration is None:
         return source
     stated = StatedValues.all_of(registration, CameraCorrection(), PoseExposurePrior())

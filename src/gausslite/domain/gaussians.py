@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int16, Int64, UInt32
+from jaxtyping import Bool, Float32, Float64, Int16, UInt32
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -80,37 +80,6 @@ class Gaussians:
         if not parts:
             return cls.empty()
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
-
-
-_ACTIVE_SHARE = 0.5
-
-
-def choose_gaussians(gaussians: Gaussians, limit: int) -> Int64[ndarray, " m"]:
-    """Return the ascending indices of at most `limit` Gaussians, the most important ones.
-
-    Up to half of them belong to the task's region (active); importance within each part is opacity times area.
-    """
-    if len(gaussians) <= limit:
-        return np.arange(len(gaussians))
-    importance = _importance(gaussians)
-    active, background = np.flatnonzero(gaussians.active), np.flatnonzero(~gaussians.active)
-    active_count = min(len(active), max(int(limit * _ACTIVE_SHARE), limit - len(background)))
-    parts = [_top(active, importance, active_count), _top(background, importance, limit - active_count)]
-    return np.sort(np.concatenate(parts))
-
-
-def _importance(gaussians: Gaussians) -> Float32[ndarray, " n"]:
-    ordered = np.sort(gaussians.scales_m, axis=1)
-    area: Float32[ndarray, " n"] = gaussians.opacities * ordered[:, 1] * ordered[:, 2]
-    return area
-
-
-def _top(rows: Int64[ndarray, " k"], importance: Float32[ndarray, " n"], count: int) -> Int64[ndarray, " c"]:
-    if count >= len(rows):
-        return rows
-    if count <= 0:
-        return rows[:0]
-    return rows[np.argpartition(importance[rows], -count)[-count:]]
 
 
 def move_gaussians(gaussians: Gaussians, T: Float64[ndarray, "4 4"]) -> Gaussians:

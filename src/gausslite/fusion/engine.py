@@ -36,13 +36,14 @@ from gausslite.fusion.keyframe_pool import (
 from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.objects import RECORD as OBJECTS
-from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
+from gausslite.fusion.objects import MergedObjects, TeamObjects, open_merged_objects
 from gausslite.fusion.refinement import RefineInput
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.update_log import PutOutcome
 from gausslite.fusion.updates import MissionClock, PendingUpdate, UpdateChecks, UpdateQueue, require_own, store_slices
 from gausslite.fusion.vote_input import VoteInput
+from gausslite.plugins import Group, load
 
 _log = logging.getLogger(__name__)
 _PUBLISHED_TILES = 8
@@ -94,7 +95,7 @@ class FusionEngine:
         self.traffic = traffic or TrafficLog()
         self.queue, self.members = UpdateQueue(), Membership(store, settings)
         self.keyframes = KeyframePool(store, settings.quotas, decode_keyframe)
-        self.objects, self._merged_objects = TeamObjects(store), MergedObjects(store)
+        self.objects, self._merged_objects = TeamObjects(store), open_merged_objects(store)
         self.frames = FrameAlignments(store, are_compared=aligner is not None)
         frames = {name: alignment for name, (_, alignment) in self.frames.by_rank().items()}
         first = time.time_ns() // 1000 if first_revision is None else first_revision
@@ -325,10 +326,14 @@ class FusionEngine:
             raise
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
-        """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
+        """Return the team's objects that a noun names, or all, the most confident first.
+
+        Raises InvalidInputError, MissingPluginError without a plug-in that merges objects.
+        """
+        merged: MergedObjects = self._merged_objects or load(Group.TEAM_OBJECTS, purpose="objects of a team")
         reports, unlocalised = self.objects.reports(), self.frames.unlocalised
         used = {name: report for name, report in reports.items() if name not in unlocalised}
-        return find_objects(self._merged_objects.of(used, self.frames.transforms()), noun)
+        return merged.find(used, self.frames.transforms(), noun)
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
         """Return the keyframes with camera poses in the fused map's frame.

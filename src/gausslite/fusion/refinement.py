@@ -1,10 +1,9 @@
-"""The protocol of what refines the fused map, a plug-in of `gausslite.refiners`: its input, settings and progress."""
+"""Input, settings and progress of what refines the fused map, a plug-in of `gausslite.refiners`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from jaxtyping import Int64
 from numpy import ndarray
@@ -16,6 +15,9 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.render.rasterizer import Rasterizer
+
+CreateRasterizer = Callable[[], Rasterizer]
+"""Creates the rasterizer when it is needed: most servers need no kernels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,31 +62,12 @@ class RefineSettings:
 
 @dataclass(frozen=True, slots=True)
 class RefineProgress:
-    """The state of a refinement after `iteration` of `iterations`; left_out: see Refinement."""
+    """The state of a refinement after `iteration` of `iterations`; left_out: agents of which
+    keyframes disagree with the vote, and how many.
+    """
 
     iteration: int
     iterations: int
     loss: float
     gaussians: int
     left_out: tuple[str, ...]
-
-
-class Refinement(Protocol):
-    """A refinement of one vote. It keeps the map's Gaussians.
-
-    sources: the agents whose keyframes train. left_out: those of which keyframes disagree with the vote, and how many.
-    """
-
-    sources: tuple[str, ...]
-    left_out: tuple[str, ...]
-
-    def steps(self) -> Iterator[RefineProgress]:
-        """Optimise, once; yields its progress, and stops where its reader does."""
-
-    def result(self) -> Gaussians:
-        """Return the best map, the vote if no other is. The Gaussians of the tasks' regions are active."""
-        ...
-
-
-OpenRefinement = Callable[[RefineInput, Rasterizer, RefineSettings], Refinement]
-"""The plug-in. Raises InvalidInputError if no keyframe agrees with the map, QuotaError if it exceeds max_gaussians."""

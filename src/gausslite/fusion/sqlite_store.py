@@ -17,7 +17,7 @@ from typing import Any
 from gausslite.codec.commit_head import COUNT_COMMIT, CommitHead
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.epochs import RECORD as EPOCH
-from gausslite.fusion.migrations import Query, missing_steps
+from gausslite.fusion.migrations import Step, missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
 
@@ -101,7 +101,7 @@ def bring_forward(db: sqlite3.Connection, path: Path) -> None:
         db.execute("COMMIT")
 
 
-def _steps(db: sqlite3.Connection, path: Path) -> tuple[Callable[[Query], None], ...]:
+def _steps(db: sqlite3.Connection, path: Path) -> tuple[Step, ...]:
     return missing_steps(str(path), _version(db), SCHEMA_VERSION)
 
 

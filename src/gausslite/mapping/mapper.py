@@ -30,7 +30,7 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows, has_guessed_depth, rows_moved_away
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
-from gausslite.mapping.moving import MovingSettings, moving_pixels, without_pixels
+from gausslite.mapping.moving import MOTION_REFERENCES, moving_pixels, without_pixels
 from gausslite.mapping.pose_corrector import LoopCounts, PoseCorrector
 from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
 from gausslite.mapping.poses import PoseTable
@@ -364,7 +364,7 @@ class GaussianMapper:
 
     def _find_moving(self, frame: Frame) -> Bool[ndarray, "h w"] | None:
         """Return the pixels of things that move, None without any; hide in a keyframe what has moved since."""
-        keyframes = self.store.kept[-MovingSettings().references :] if self.settings.leaves_out_moving else ()
+        keyframes = self.store.kept[-MOTION_REFERENCES:] if self.settings.leaves_out_moving else ()
         frames = [keyframe.frame for keyframe in keyframes]
         if keyframes:
             # one keyframe with each frame

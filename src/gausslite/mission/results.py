@@ -20,43 +20,20 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import write_ply
-from gausslite.codec.run_files import (
-    KeyframeView,
-    ViewImage,
-    write_keyframe_depths,
-    write_keyframe_views,
-    write_view_images,
-)
+from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.codec.state_file import write_atomic
 from gausslite.datasets.folder import format_pose_rows
 from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, unit_up_axis
-from gausslite.domain.relevance import largest_roi_per_segment
-from gausslite.mapping.free_space import DepthView
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 
-_PHOTOGRAPHS = 4
-_MAX_DEPTH_IMAGES = 400
-"""With 160 x 120 pixels, 15 MB of a run."""
-
 
 def write_keyframes(folder: Path, keyframes: Sequence[Keyframe]) -> None:
-    """Write keyframes.json, reduced depth, and in `views` photographs with the largest region of each quarter.
-
-    keyframes: oldest first. Raises StorageError.
-    """
-    views = [_view(keyframe) for keyframe in keyframes]
-    write_keyframe_views(folder, views)
-    frames = [keyframe.frame for keyframe in keyframes[:: -(-len(keyframes) // _MAX_DEPTH_IMAGES) or 1]]
-    write_keyframe_depths(folder, {frame.index: DepthView.reduced(frame).depth_m for frame in frames})
-    chosen = sorted(largest_roi_per_segment([view.roi_pixels for view in views], _PHOTOGRAPHS))
-    photographed = [keyframes[i] for i in chosen]
-    write_view_images(
-        folder, [ViewImage(kept.frame.index, kept.frame.rgb, kept.relevance.roi) for kept in photographed]
-    )
+    """Write keyframes.json. keyframes: oldest first. Raises StorageError."""
+    write_keyframe_views(folder, [_view(keyframe) for keyframe in keyframes])
 
 
 def _view(keyframe: Keyframe) -> KeyframeView:

@@ -7,16 +7,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
-from gausslite.datasets.corrected import CorrectedSource, ideal_camera, undistort_frame
+from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
-from gausslite.domain.camera import CameraMotion, Lens
 from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import Twist
-from gausslite.domain.recording import CameraCorrection
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.mission.localisation_monitor import UNPLACED
 from gausslite.mission.settings import SourceSettings
 from gausslite.mission.task_mapper import TRACKING_LOST, FrameOutcome
@@ -50,7 +46,8 @@ class FrameStream:
         """
         source = open_source(settings.spec, settings.up_axis, settings.depth_registration, settings.require_poses)
         correction = settings.camera_correction or CameraCorrection(source.lens)
-        return cls.select(source if correction.is_identity else CorrectedSource(source, correction), settings)
+        stated = StatedValues.all_of(None, correction, PoseExposurePrior())
+        return cls.select(open_calibrator().calibrate(source, stated).source, settings)
 
     @classmethod
     def select(cls, source: Source, settings: SourceSettings) -> FrameStream:
@@ -94,20 +91,6 @@ class CorruptFrames:
         self.count += 1
         self.first_error = self.first_error or error
         self._report(f"frame {index} skipped: {error}")
-
-
-def correct_live_frame(frame: Frame, lens: Lens | None) -> Frame:
-    """Return the frame without lens distortion; its motion states rolling shutter and blur of the returned image.
-
-    lens: that of the recorded image, None for a pinhole. Raises InvalidInputError for a lens without a usable pinhole
-    camera.
-    """
-    motion = frame.motion or CameraMotion(Twist(np.zeros(3), np.zeros(3)))
-    correction = CameraCorrection(lens, motion.readout_s, exposure_s=motion.exposure_s)
-    if correction.is_identity:
-        return frame
-    ideal = ideal_camera(frame.camera, CameraCorrection(lens), 0.0)
-    return undistort_frame(frame, correction, ideal, motion.twist)
 
 
 _NO_FRAME_INDEX = -1

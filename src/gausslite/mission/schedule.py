@@ -1,54 +1,18 @@
-"""What happens over a mission's time: tasks that change at known frames, the map's states, and a row for each frame."""
+"""The tasks of a mission over its time: those that change at known frames, and what a person says meanwhile."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-
-from gausslite.codec.run_files import MapSnapshot, write_map_history
-from gausslite.codec.state_file import write_atomic
-from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
 from gausslite.domain.relevance import PointedObject, PointM
-from gausslite.domain.state import EvenHistory
 from gausslite.domain.task import TaskGraph, TaskParser
-from gausslite.mapping.poses import PoseTable
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-
-_MAX_SNAPSHOTS, _LEAST_GAP_NS = 48, 250_000_000
-
-
-@dataclass(slots=True)
-class MapRecorder:
-    """Keeps at most 48 snapshots (25 ms and 230 kB each), four a second of the recording at most."""
-
-    _snapshots: EvenHistory[MapSnapshot] = field(default_factory=lambda: EvenHistory(_MAX_SNAPSHOTS, _LEAST_GAP_NS))
-
-    def record(self, poses: PoseTable, gaussians: Callable[[], Gaussians]) -> None:
-        """Take a snapshot of the map after a frame, if one is due."""
-        latest = poses.latest()
-        if latest is None or not self._snapshots.is_due(latest.capture_time_ns):
-            return
-        # a map with a value that the codec refuses is still mapped further
-        with suppress(InvalidInputError):
-            snapshot = MapSnapshot.of(latest.capture_time_ns, gaussians())
-            self._snapshots.add(snapshot.time_ns, snapshot)
-
-    def write(self, folder: Path) -> None:
-        """Write map_history.safetensors, with the snapshots since the start of this run. Raises StorageError."""
-        write_map_history(folder, self._snapshots.states)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,48 +113,3 @@ class ScheduledTaskMapper:
         self.graph = extended
         self.mapper.point_at(masks, excluded_m)
         return extended
-
-
-_FILE = "frames.csv"
-COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share", "localisation")
-"""localisation: a value of `LocalisationState`."""
-_MAX_ROWS = 100_000
-
-
-@dataclass(slots=True)
-class Timeline:
-    """The rows of frames with their place or without it; every second one is removed whenever there are max_rows."""
-
-    max_rows: int = _MAX_ROWS
-    _rows: list[tuple[float, ...]] = field(default_factory=list)
-
-    def add(self, outcome: FrameOutcome) -> None:
-        """Add one frame."""
-        for shown in outcome.mapped or (outcome,) * (outcome.localisation > 0):
-            figures = shown.index, shown.timing.seconds, shown.iterations, shown.gaussians, shown.roi_share
-            self._rows.append((*figures, shown.localisation))
-        if len(self._rows) >= self.max_rows:
-            del self._rows[1::2]
-
-    def write(self, folder: Path) -> None:
-        """Write frames.csv. Raises StorageError."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in self._rows)
-        write_atomic(folder / _FILE, text.getvalue().encode())
-
-
-def read_timeline(folder: Path) -> dict[str, Float64[ndarray, " n"]]:
-    """Return the columns of frames.csv by name; empty if the folder has none. Raises MapFileError."""
-    path = folder / _FILE
-    if not path.exists():
-        return {}
-    try:
-        header, *rows = csv.reader(path.read_text().splitlines())
-        values = np.array(rows, np.float64).reshape(len(rows), len(COLUMNS))
-    except (OSError, ValueError, csv.Error) as error:
-        raise MapFileError(f"{path}: expected the frames of a run, got an unreadable file: {error}") from error
-    if tuple(header) != COLUMNS or not np.isfinite(values).all():
-        raise MapFileError(f"{path}: expected finite columns {','.join(COLUMNS)}, got others")
-    return dict(zip(COLUMNS, values.T, strict=True))

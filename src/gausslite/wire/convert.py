@@ -309,6 +309,12 @@ def decode_frame(data: bytes) -> Frame:
     return frame_from_message(message)
 
 
+def pose_of_encoded_frame(data: bytes) -> Float64[ndarray, "4 4"]:
+    """Decode T_world_camera of a frame without its images. Raises InvalidInputError, PoseError."""
+    message = geometry_pb2.EncodedFrame.FromString(data)
+    return transform_from_message("keyframe t_world_camera", message.t_world_camera)
+
+
 def grid_to_message(grid: VoxelGrid) -> geometry_pb2.VoxelGrid:
     """Encode a voxel grid."""
     return geometry_pb2.VoxelGrid(size_m=grid.size_m)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
-from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 from gausslite.datasets.source import HeldOutSplit, Source
@@ -22,6 +21,7 @@ from gausslite.domain.relevance import MIN_ROI_PIXELS
 from gausslite.mission.settings import SceneInfo
 from gausslite.nouns import head_of
 from gausslite_bench.quality.scenes import Scene, UnseenRegionError, make_scene
+from gausslite_calibration.corrected import CorrectedSource
 from gausslite_evaluation.views import HeldOutView
 
 REAL_CAMERA = PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03)

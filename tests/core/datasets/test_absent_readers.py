@@ -14,9 +14,12 @@ from gausslite.cli.main import main
 from gausslite.config.values import AUTO
 from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.open import open_source
+from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, MissingPluginError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.mission.recording import calibrate_with_messages, stated_values
+from gausslite.mission.runner import FrameStream
+from gausslite.mission.settings import SourceSettings
 
 READERS = ("gausslite_ros", "gausslite_recorders", "gausslite_sim")
 ABSENT = "needs the package gausslite_calibration, which is not installed"
@@ -73,23 +76,44 @@ def test_stated_values_are_used_without_a_calibrator(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
-    prior, correction = PoseExposurePrior(0.01, 0.5), CameraCorrection(readout_s=0.01)
-    stated = StatedValues.all_of(None, correction, prior)
+    prior = PoseExposurePrior(0.01, 0.5)
+    stated = StatedValues.all_of(None, CameraCorrection(), prior)
     expected = open_calibrator().calibrate(source, stated)
     remove_package(monkeypatch, "gausslite_calibration")
     found = calibrate_with_messages("seq", source, stated)
-    assert (found.registration, found.correction, found.pose_prior) == (None, correction, prior)
+    assert (found.registration, found.correction, found.pose_prior) == (None, CameraCorrection(), prior)
     frame, other = found.source.frame(1), expected.source.frame(1)
     np.testing.assert_array_equal(frame.depth_m, other.depth_m)
     assert (frame.camera, frame.motion) == (other.camera, other.motion)
     assert capsys.readouterr().err == ""
 
 
-def test_a_registration_names_its_absent_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_registration_and_a_correction_name_their_absent_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, camera = write_seven_scenes(tmp_path / "seq"), DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")
+    frame = open_source(str(folder)).frame(0)
     remove_package(monkeypatch, "gausslite_calibration")
     with pytest.raises(MissingPluginError, match=f"register-depth: {ABSENT}"):
         open_source(str(folder), depth_registration=camera)
+    with pytest.raises(MissingPluginError, match=f"camera-correction: {ABSENT}"):
+        FrameStream.open(SourceSettings(str(folder), camera_correction=CameraCorrection(readout_s=0.01)))
+    assert open_calibrator().live_frame(frame, None) is frame
+    with pytest.raises(MissingPluginError, match=f"lens of a frame: {ABSENT}"):
+        open_calibrator().live_frame(frame, Lens.parse("radtan:0.1,0,0,0"))
+
+
+def test_a_lens_of_the_files_stays_in_the_images_without_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_tum(tmp_path / "fr1")
+    recorded, corrected = open_source(str(folder)), FrameStream.open(SourceSettings(str(folder))).source
+    remove_package(monkeypatch, "gausslite_calibration")
+    found = FrameStream.open(SourceSettings(str(folder))).source
+    assert found.frame(0).rgb.tobytes() == recorded.frame(0).rgb.tobytes()
+    assert (found.lens, corrected.lens) == (recorded.lens, None)
+    note = gl.open_calibrated(folder).notes[-1]
+    assert note == f"not corrected: the lens {found.lens}; gausslite.calibrators: {ABSENT}"
 
 
 def test_one_line_says_what_is_not_estimated_without_a_calibrator(

@@ -10,7 +10,6 @@ import pytest
 from gausslite.domain.camera import Camera, CameraMotion, Lens
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import Trajectory, Twist
-from gausslite.domain.state import EvenHistory
 
 TURN = Twist(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 NO_RAY = (np.array([0.1, 2.0]), np.array([0.0, 0.0]))
@@ -29,7 +28,6 @@ NO_RAY = (np.array([0.1, 2.0]), np.array([0.0, 0.0]))
         (lambda: CameraMotion(TURN, 0.0, 0.5), "exposure_s"),
         (lambda: CameraMotion(Twist(np.full(3, np.nan), np.zeros(3)), 0.03), "linear_m_s"),
         (lambda: CameraMotion(Twist(np.zeros(3), np.array([0.0, np.inf, 0.0])), 0.03), "angular_rad_s"),
-        (lambda: EvenHistory(2), "at least 3, got 2"),
         *(
             (lambda text=text: Lens.parse(text), "lens")
             for text in ("", "radtan", "radtan:1,2", "fisheye:1,2,3,4,5", "radtan:a,b,c,d", "radtan:nan,0,0,0")

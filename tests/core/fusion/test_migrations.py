@@ -8,16 +8,17 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from absent_package import remove_package
 from opened_stores import OpenStore
 from support.sample_batches import random_subset
 
-from gausslite.domain.errors import StorageError
+from gausslite.domain.errors import MissingPluginError, StorageError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignments
 from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
-from gausslite.fusion.migrations import STEPS
 from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
 from gausslite.fusion.store import FusionStore
+from gausslite_operations.migrations import STEPS
 from gausslite_operations.store_maintenance import back_up, restore, verify
 
 DUMPS = {path.stem: path for path in (Path(__file__).parent / "stores").glob("*.sql")}
@@ -89,7 +90,7 @@ def test_the_file_before_is_kept_and_a_failed_step_changes_nothing(
         raise sqlite3.OperationalError("database or disk is full")
 
     with monkeypatch.context() as patched:
-        patched.setattr("gausslite.fusion.migrations.STEPS", (*STEPS[:-1], fail))
+        patched.setattr("gausslite_operations.migrations.STEPS", (*STEPS[:-1], fail))
         with pytest.raises(StorageError, match="no space left"):
             SqliteStore(path)
     for reader in (verify, lambda own: back_up(own, tmp_path / "copy")):
@@ -102,6 +103,15 @@ def test_the_file_before_is_kept_and_a_failed_step_changes_nothing(
     assert restore(kept, path)[0].voxels == 5
     with closing(SqliteStore(path)) as store:
         assert store.keyframe("ant", 5) == b"an image"
+
+
+def test_without_the_package_an_earlier_store_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = sqlite_of(f"sqlite-{EARLIER[0]}", tmp_path / "store.sqlite")
+    remove_package(monkeypatch, "gausslite_operations")
+    with pytest.raises(MissingPluginError, match=f"version {EARLIER[0]}: needs the package gausslite_operations"):
+        SqliteStore(path)
+    monkeypatch.undo()
+    SqliteStore(path).close()
 
 
 def test_damage_is_not_hidden_by_a_new_checksum(tmp_path: Path) -> None:

@@ -23,11 +23,11 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import Twist, require_rigid
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TargetRole, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelBatch, VoxelGrid
-from gausslite.mission.runner import correct_live_frame
 from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire import convert, convert_task
 from gausslite.wire.clients import is_done
 from gausslite.wire.convert import decode_colour, encode_colour, encode_depth
+from gausslite_calibration.calibrate import live_frame as corrected
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
 
@@ -224,7 +224,7 @@ def test_any_lens_gives_a_frame_or_an_error_about_it(coefficients: list[float], 
     lens = Lens(LensModel(model), tuple(coefficients[: 8 if model == "radtan" else 4]))
     with contextlib.suppress(InvalidInputError):
         live_frame = convert.live_frame_from_message(convert.frame_to_message(sample_frame(), lens=lens))
-        frame = correct_live_frame(*live_frame)
+        frame = corrected(*live_frame)
         assert np.isfinite(frame.depth_m).all()
 
 
@@ -238,7 +238,7 @@ def test_changed_frame_bytes_give_a_valid_frame_or_a_gausslite_error(data: st.Da
         noisy[data.draw(st.integers(0, len(noisy) - 1))] = data.draw(st.integers(0, 255))
     try:
         live_frame = convert.live_frame_from_message(geometry_pb2.EncodedFrame.FromString(bytes(noisy)))
-        frame = correct_live_frame(*live_frame)
+        frame = corrected(*live_frame)
     except (GaussLiteError, DecodeError):
         return
     size = (frame.camera.height_px, frame.camera.width_px)

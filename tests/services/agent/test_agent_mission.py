@@ -22,7 +22,6 @@ from signals import hangup
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
-from gausslite.codec.run_files import read_map_history
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, StorageError, TaskError
@@ -32,7 +31,6 @@ from gausslite.domain.relevance import BallRegion, Region
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mission.results import locked_folder
 from gausslite.mission.runner import FrameStream
-from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.plugins import Group
@@ -51,6 +49,8 @@ from gausslite_agent.settings import AgentSettings, parse_arguments
 from gausslite_agent.state import EndRequest, MissionState
 from gausslite_language.rules import RuleParser
 from gausslite_view.decoding import stored_keyframe_from_message
+from gausslite_view.map_history import read_map_history
+from gausslite_view.timeline import read_timeline
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
@@ -190,7 +190,7 @@ def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
 def test_without_a_plug_in_that_selects_keyframes_none_are_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    register(monkeypatch, Group.KEYFRAME_SELECTIONS)
+    register(monkeypatch, Group.KEYFRAME_UPLOADS)
     options = settings(tmp_path, "--set", "handover=true", "--fusion", "localhost:1")
     with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
         mission.run(stream_of(Wall(), options))

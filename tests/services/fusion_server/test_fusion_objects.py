@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import grpc
 import pytest
+from absent_package import remove_package
 from fusion_running import GRAPH, GRID, MUG, fusion_server
 
-from gausslite.domain.errors import InvalidInputError, SessionUnknownError, TaskError
+from gausslite.domain.errors import InvalidInputError, MissingPluginError, SessionUnknownError, TaskError
 from gausslite.domain.objects import ObjectReport, ObjectRole
 from gausslite.domain.task import TaskGraph
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -68,3 +69,13 @@ def test_hostile_reports_and_queries_are_refused_and_change_nothing() -> None:
         with pytest.raises(TaskError):
             server.client.join("bee", GRID, task=TaskGraph("", "", (), (), ()))
         assert len(server.client.query_objects()) == 1
+
+
+def test_a_server_without_the_package_keeps_reports_and_a_query_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    remove_package(monkeypatch, "gausslite_objects")
+    with fusion_server() as server:
+        session = server.client.join("ant", GRID).session_id
+        server.client.report_objects(session, ObjectReport(GRAPH, (MUG,)))
+        assert [list(agent.targets) for agent in server.client.status().agents] == [["mug"]]
+        with pytest.raises(MissingPluginError, match="objects of a team: needs the package gausslite_objects"):
+            server.client.query_objects()

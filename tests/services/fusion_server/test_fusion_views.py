@@ -9,20 +9,20 @@ from unittest.mock import patch
 import grpc
 import numpy as np
 import pytest
+from absent_package import remove_package
 from fusion_running import CAMERA, GRID, fusion_server, make_subset, photograph
 from sample_gaussians import textured_corner
 from torch_oracle.rasterizer import ReferenceRasterizer
 from waiting import wait_until
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError, UnavailableError
+from gausslite.domain.errors import InvalidInputError, MissingPluginError, PoseError, QuotaError, UnavailableError
 from gausslite.domain.pose import transform_of
 from gausslite.domain.voxels import RoiSubset, empty_batch, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import FrameFit
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings, MissionConfig
-from gausslite.fusion.map_renderer import MapRenderer
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.channel import require_serving
@@ -31,6 +31,7 @@ from gausslite.wire.views import MAX_VIEWS_WAITING, view_to_pngs
 from gausslite_fusion_server import servicer
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import SurfaceSamples, fit_frame
+from gausslite_render.fused_view import MapRenderer
 
 CELLS = {0: [5, 6], 1: [7], 2: [1, 1]}
 
@@ -46,6 +47,15 @@ def test_views_of_the_map_are_rendered() -> None:
         assert rgb.shape == (24, 32, 3)
         assert rgb.any()
         assert depth_m.max() == pytest.approx(1.05, abs=0.15)
+
+
+def test_a_server_without_the_package_refuses_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    remove_package(monkeypatch, "gausslite_render")
+    with (
+        fusion_server() as server,
+        pytest.raises(MissingPluginError, match="needs the package gausslite_render"),
+    ):
+        server.client.render(CAMERA, np.eye(4))
 
 
 def test_hostile_views_are_refused() -> None:

@@ -22,7 +22,6 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.map_changes import EncodedPartCache
 from gausslite.wire.views import ChangeNotifier
-from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.watch import FusedMapReader, WatchedPart
 
@@ -34,7 +33,7 @@ def watching(settings: FusionSettings, body: Callable[[AsyncIterator[MapBlock], 
 
     async def run() -> None:
         engine = FusionEngine(SqliteStore(), settings, first_revision=1)
-        servicer = FusionServicer(engine, RefinementWorker(RefineSettings(), ReferenceRasterizer))
+        servicer = FusionServicer(engine, RefineSettings(), ReferenceRasterizer)
         session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
         responses = servicer.WatchFusedMap(pb.WatchFusedMapRequest(), Context("unix:"))
 

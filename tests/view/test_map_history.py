@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from sample_gaussians import random_gaussians
 
-from gausslite.codec.run_files import MAX_GAUSSIANS, MapSnapshot, read_map_history, write_map_history
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.gaussians import Gaussians
+from gausslite_view.map_history import MAX_GAUSSIANS, MapSnapshot, read_map_history, write_map_history
 
 FILE = "map_history.safetensors"
 

@@ -18,7 +18,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch
 from gausslite.wire.clients import FusionClient
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.team_map import TeamMapFollower
+from gausslite_link.team_map import TeamMapFollower
 
 GRAPH = TaskGraph("t", "Pick up the box and the mug", ("box", "mug"), (), ())
 OTHER = TaskGraph("t", "Pick up the mug", ("mug",), (), ())

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from sample_gaussians import random_gaussians
 
-from gausslite.codec.run_files import read_map_history
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.mapping.poses import PoseTable
-from gausslite.mission.schedule import MapRecorder
+from gausslite_view.map_history import MapRecorder, read_map_history
 
 CAMERA = Camera(4.0, 4.0, 2.0, 2.0, 4, 4)
 
@@ -27,11 +26,11 @@ def add(poses: PoseTable, added: Frame) -> None:
 
 def test_snapshots_of_the_growing_map_are_written(tmp_path):
     recorder, poses = MapRecorder(), PoseTable()
-    recorder.record(poses, lambda: random_gaussians(1))
+    recorder.add(None, poses, lambda: random_gaussians(1))
     for index in range(30):
         add(poses, frame(index, index * 100_000_000))
-        recorder.record(poses, lambda count=index + 1: random_gaussians(count))
-    recorder.write(tmp_path)
+        recorder.add(None, poses, lambda count=index + 1: random_gaussians(count))
+    recorder.write(tmp_path, ())
     snapshots = read_map_history(tmp_path)
     assert [each.time_ns // 100_000_000 for each in snapshots] == list(range(0, 30, 3))
     assert [each.total for each in snapshots] == list(range(1, 31, 3))
@@ -41,6 +40,6 @@ def test_a_map_that_the_codec_refuses_is_left_out(tmp_path):
     recorder, poses = MapRecorder(), PoseTable()
     add(poses, frame(0, 0))
     flat = replace(random_gaussians(5), scales_m=np.zeros((5, 3), np.float32))
-    recorder.record(poses, lambda: flat)
-    recorder.write(tmp_path)
+    recorder.add(None, poses, lambda: flat)
+    recorder.write(tmp_path, ())
     assert read_map_history(tmp_path) == ()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians, random_gaussians
 
-from gausslite.domain.gaussians import choose_gaussians
+from gausslite_view.important_gaussians import choose_gaussians
 
 
 def test_level_of_detail_keeps_the_most_important_of_each_part():

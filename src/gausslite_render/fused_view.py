@@ -1,8 +1,9 @@
-"""Render a layer of the fused map, from a copy that follows it tile by tile."""
+"""Render a layer of the fused map, from a copy that follows it tile by tile.
+
+`MapRenderer` is the default plug-in of the group `gausslite.map_renderers`.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -11,10 +12,8 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera
 from gausslite.domain.pose import inverse
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
+from gausslite.fusion.refinement import CreateRasterizer
 from gausslite.render.rasterizer import ROW_WIDTH, Rasterizer, Rendering, gaussians_to_rows
-
-CreateRasterizer = Callable[[], Rasterizer]
-"""Creates the rasterizer when it is needed: most servers need no kernels."""
 
 
 class _LayerCopy:

@@ -1,4 +1,7 @@
-"""Run a joint refinement on its own thread, and report its progress."""
+"""Run a joint refinement on its own thread, and report its progress.
+
+`RefinementWorker` is the default plug-in of the group `gausslite.refiners`; the protocol is `Refiner` of the server.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,13 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from threading import Event
 
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.fusion.map_renderer import CreateRasterizer
-from gausslite.fusion.refinement import OpenRefinement, RefineProgress, RefineSettings
-from gausslite.plugins import Group, load
-from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
 from gausslite.wire.views import ChangeNotifier
+from gausslite_refinement.refinement import Refinement
 
 _log = logging.getLogger(__name__)
 
@@ -24,20 +23,17 @@ _log = logging.getLogger(__name__)
 class RefinementWorker:
     """Runs one refinement at a time. The rasterizer is created by the first refinement, since other calls need none."""
 
-    def __init__(self, settings: RefineSettings, create_rasterizer: CreateRasterizer) -> None:
-        self._settings = settings
-        self.create_rasterizer = create_rasterizer
+    def __init__(self, create_rasterizer: CreateRasterizer) -> None:
+        self._create_rasterizer = create_rasterizer
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
 
-    async def run(self, engine: FusionEngine, request: pb.RefineFusedMapRequest) -> AsyncIterator[RefineProgress]:
+    async def run(self, engine: FusionEngine, settings: RefineSettings) -> AsyncIterator[RefineProgress]:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
 
         A slow reader misses some progress, but never the last one. Raises QuotaError if another refinement runs, and
-        those of OpenRefinement; MissingPluginError.
+        those of Refinement.
         """
-        settings = self._settings_for(request)
-        open_refinement: OpenRefinement = load(Group.REFINERS, purpose="refinement")
         if self._busy:
             raise QuotaError("refinement: expected one at a time, got a second while one is running")
         self._busy = True
@@ -50,7 +46,7 @@ class RefinementWorker:
 
         def work() -> None:
             vote = engine.refinement_input()
-            refinement = open_refinement(vote, self.create_rasterizer(), settings)
+            refinement = Refinement(vote, self._create_rasterizer(), settings)
             for line in refinement.left_out:
                 _log.warning("refinement: left out, because they disagree with the vote: %s", line)
             for progress in refinement.steps():
@@ -77,17 +73,6 @@ class RefinementWorker:
     def close(self) -> None:
         """Wait until the last refinement has ended after its cancellation."""
         self._worker.shutdown(wait=True, cancel_futures=True)
-
-    def _settings_for(self, request: pb.RefineFusedMapRequest) -> RefineSettings:
-        if request.iterations > MAX_REFINE_ITERATIONS:
-            raise QuotaError(f"refine iterations: expected at most {MAX_REFINE_ITERATIONS}, got {request.iterations}")
-        default = self._settings
-        return replace(
-            default,
-            iterations=request.iterations or default.iterations,
-            max_gaussians=min(request.max_gaussians or default.max_gaussians, default.max_gaussians),
-            seed=request.seed,
-        )
 
     def _finish(self, progress_notifier: ChangeNotifier) -> None:
         self._busy = False

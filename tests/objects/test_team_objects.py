@@ -20,8 +20,8 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
-from gausslite.fusion.objects import MAX_COMPARISONS, MergedObjects, find_objects, group_boxes, merge_objects
 from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite_objects.team_objects import MAX_COMPARISONS, MergedObjects, find_objects, group_boxes, merge_objects
 
 GRAPH = TaskGraph("t", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
 ANYTHING = MissionConfig("", "", 0.10)
@@ -171,7 +171,7 @@ def test_landmarks_are_merged_as_if_all_pairs_were_compared(
         return landmark(str(rng.choice(["mug", "cup"])), centre, number, float(rng.uniform(0, largest_m)))
 
     reports = {name: report(*map(random_landmark, range(6))) for name in "abcd"}
-    with patch("gausslite.fusion.objects._GROUP", largest_group):
+    with patch("gausslite_objects.team_objects._GROUP", largest_group):
         merged = merge_objects(reports)
     observers = {frozenset((seen.agent_id, seen.object_id) for seen in found.observers) for found in merged}
     assert observers == merge_all_pairs(reports)
@@ -189,7 +189,7 @@ def test_the_number_of_comparisons_is_bounded_however_many_landmarks_there_are(s
 
 def test_objects_are_merged_once_until_a_report_or_a_frame_changes() -> None:
     reports, merged = {"ant": report(landmark("mug", (1, 0, 0)))}, MergedObjects(SqliteStore())
-    with patch("gausslite.fusion.objects.merge_objects", wraps=merge_objects) as merging:
+    with patch("gausslite_objects.team_objects.merge_objects", wraps=merge_objects) as merging:
         first = merged.of(reports, {})
         assert merged.of(dict(reports), {}) is first
         merged.of(reports, {"ant": np.eye(4)})

@@ -1,4 +1,7 @@
-"""Follow the fused map in the region of the agent's task, and insert voxels that teammates trained more."""
+"""Follow the fused map in the region of an agent's task, and insert voxels that teammates trained more.
+
+`TeamMapFollower` is the default plug-in of the group `gausslite.team_maps`.
+"""
 
 from __future__ import annotations
 

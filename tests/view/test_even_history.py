@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gausslite.domain.state import EvenHistory
+from gausslite.domain.errors import InvalidInputError
+from gausslite_view.even_history import EvenHistory
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100, 3000])
@@ -55,3 +56,8 @@ def test_a_state_of_the_same_time_replaces_and_an_earlier_one_begins_again():
     assert history.is_due(5)
     history.add(5, "d")
     assert history.states == ("d",)
+
+
+def test_a_history_that_keeps_no_state_between_its_ends_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="at least 3, got 2"):
+        EvenHistory(2)

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from tum_recording import write_home
 
-from gausslite.datasets.corrected import CorrectedSource, ideal_camera, undistort_frame
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist
 from gausslite.domain.recording import CameraCorrection
-from gausslite.mission.runner import FrameStream, correct_live_frame
+from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import SourceSettings
+from gausslite_calibration.calibrate import live_frame
+from gausslite_calibration.corrected import CorrectedSource, ideal_camera, undistort_frame
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
 MOTION = CameraMotion(Twist(np.array([0.3, -0.1, 0.2]), np.array([0.5, 1.5, -0.4])), readout_s=0.03, exposure_s=0.01)
@@ -33,7 +34,7 @@ def sample_frame() -> Frame:
 
 def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
     plain = sample_frame()
-    got = correct_live_frame(replace(plain, motion=MOTION), LENS)
+    got = live_frame(replace(plain, motion=MOTION), LENS)
     correction = CameraCorrection(LENS, MOTION.readout_s, exposure_s=MOTION.exposure_s)
     ideal = ideal_camera(CAMERA, CameraCorrection(LENS), 0.0)
     expected = undistort_frame(plain, correction, ideal, MOTION.twist)
@@ -50,13 +51,13 @@ def test_a_live_frame_is_corrected_as_a_recorded_one() -> None:
 
 def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
     frame = sample_frame()
-    assert correct_live_frame(frame, None) is frame
+    assert live_frame(frame, None) is frame
 
 
 @pytest.mark.parametrize("text", ["fisheye:-900,0,0,0", "radtan:-900,0,0,0"])
 def test_a_lens_without_a_pinhole_camera_is_named_in_the_error(text: str) -> None:
     with pytest.raises(InvalidInputError, match=f"lens {text}: expected one that can be inverted"):
-        correct_live_frame(sample_frame(), Lens.parse(text))
+        live_frame(sample_frame(), Lens.parse(text))
 
 
 def test_an_agents_recording_is_corrected_by_the_lens_that_its_files_state(tmp_path: Path) -> None:
