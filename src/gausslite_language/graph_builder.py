@@ -40,7 +40,6 @@ class GraphBuilder:
         self._pending: str | None = None
         self._alternative: str | None = None  # "under" in "under or behind the couch"
         self._negated = False
-        self._avoids = False  # the negation itself means contact: "avoid touching"
         self._corrects = False
         self._negated_objects: list[str] = []
         self._partitive: tuple[NounPhrase, str | None, bool] | None = (
@@ -137,10 +136,9 @@ class GraphBuilder:
             self._assigner.reach_places()  # "wait by the door but don't open it"
         self._corrects = word == "not" and not self._draft.targets
         self._negate()
-        self._avoids = word.startswith("avoid ")
 
     def _negate(self) -> None:
-        self._pending, self._negated, self._avoids, self._negated_objects = None, True, False, []
+        self._pending, self._negated, self._negated_objects = None, True, []
         self._clause.nouns_since_negation = 0
         self._clause.verb_since_negation = False
 
@@ -377,7 +375,7 @@ class GraphBuilder:
         clause.nouns_since_negation += 1
         if not direct:
             self._place_negated(noun, pending or "near")
-        elif self._avoids or (clause.verb_since_negation and self._may_harm(pending)):
+        elif clause.verb_since_negation and self._may_harm(pending):
             self._draft.add_target(noun.text, TargetRole.OBSTACLE)
             self._negated_objects.append(noun.text)
         else:

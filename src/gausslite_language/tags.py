@@ -107,6 +107,9 @@ Options = dict[Tag, int]
 
 # "go stand", "help clean": the second verb is the instruction
 _LEADING_VERBS: Final = word_set("go come help")
+_AVOIDS: Final = word_set("avoid avoiding evade evading")
+_STOPS: Final = word_set("stop stopping quit quitting cease ceasing")
+_ENTERED: Final = word_set("on above past inside to from")
 _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
 _MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
 _USUALLY_VERBS: Final = verbs.GO_VERBS | verbs.TOOL_VERBS | verbs.SEARCH_VERBS | word_set("stop hand")
@@ -153,7 +156,27 @@ def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
     kept = [unit for unit in units if not is_adverb(unit)]
     later = (kept[at + 2 : at + 4] if kept[at + 1 : at + 2] != ["the"] else [] for at in range(len(kept)))
     neighbours = zip(["", *kept], kept, [*kept[1:], ""], later, strict=False)
-    return list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True))
+    return _deny_gerunds(list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True)))
+
+
+def _deny_gerunds(tagged: list[tuple[str, Tag]]) -> list[tuple[str, Tag]]:
+    """Return the words with the "avoid" of "avoid placing", and the "stop" of "stop placing", as negations.
+
+    "Stop driving at the gate" keeps its verb: the gate is where the robot stops.
+    """
+    read: list[tuple[str, Tag]] = []
+    for at, (word, tag) in enumerate(tagged):
+        following, place = [*tagged[at + 1 : at + 3], ("", tag), ("", tag)][:2]
+        stops_there = verbs.base_of_ing(following[0]) in verbs.GO_VERBS and place[1] is Tag.PREPOSITION
+        stops_there = stops_there and PREPOSITIONS.get(split_bounds(place[0])[0]) not in _ENTERED
+        denies = word in _AVOIDS or (word in _STOPS and not stops_there)
+        if not denies or tag not in (Tag.VERB, Tag.GERUND) or following[1] is not Tag.GERUND:
+            read.append((word, tag))
+        elif read and read[-1][1] is Tag.NEGATION:
+            read.pop()  # "do not stop wiping"
+        else:
+            read.append(("do not", Tag.NEGATION))
+    return read
 
 
 def is_adverb(word: str) -> bool:

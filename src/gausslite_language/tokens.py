@@ -248,14 +248,15 @@ _PLAIN: Final = {
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
     r"(?:be|being) careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|"
-    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|by no means|"
+    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|avoid to|by no means|"
     r"it is forbidden to|(?:you )?(?:need not|(?:do not|don't) (?:have|need) to|are not (?:allowed|permitted) to)|"
     r"(?:under|in) no (?:circumstance|case)s?(?: should you)?": "do not",
     r"^(\w+) nothing": r"do not \1 anything",
     r"(?:keep (?:your|the) )?(?:hands|fingers) (?:off|away from)": "do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
-    r"(?<=, )avoiding|(?:stay|keep) out of": "avoid",
+    r"(?:stay|keep) out of": "avoid",
+    r"(?<!while),? avoiding": ", avoid",
     r"give (.{2,60}?) a (?:wide )?berth": r"avoid \1",
     r"(?:stay|keep|remain) close to": "follow",
     r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",

@@ -91,6 +91,10 @@ def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
         ("I'd rather have the pear than the apple", "apple"),
         ("You needn't clean the mirror, clean the sink", "mirror"),
         ("Leave the jug, take the cup", "jug"),
+        ("Mop the stairs and avoid mopping the ramp", "ramp"),
+        ("Stop stacking crates near the exit and stack them by the wall", "exit"),
+        ("You should avoid driving on the lawn, go to the shed", "lawn"),
+        ("Go to the gate avoiding people", "person"),
     ],
 )
 def test_what_is_denied_is_not_handled(text, denied):
@@ -274,7 +278,12 @@ def test_a_negated_relation_is_never_read_as_its_opposite(text, relation):
 
 
 @pytest.mark.parametrize(
-    "text", ["Take the keys and don't forget the umbrella", "Don't forget to take the keys and the umbrella"]
+    "text",
+    [
+        "Take the keys and don't forget the umbrella",
+        "Don't forget to take the keys and the umbrella",
+        "Don't stop carrying the keys and the umbrella",
+    ],
 )
 def test_a_double_negation_is_a_request(text):
     graph = RuleParser().parse(text)
