@@ -28,6 +28,9 @@ _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION,
 _OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
 _SUBJECT_KINDS: Final = (ChunkKind.NOUN, ChunkKind.PREPOSITION)
 _PERMISSIONS: Final = word_set("may can could")
+_PLACING: Final = verbs.DELIVERY_VERBS | verbs.GIVING_VERBS | verbs.FILLING_VERBS | verbs.PUSHING_VERBS
+_OBJECT_PHRASE_TAGS: Final = OBJECT_START_TAGS | {Tag.ANAPHOR}
+_DO_FORMS: Final = word_set("do does did")
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
 _BELONGING_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE})
@@ -132,6 +135,8 @@ class VerbChunker:
         self._end_relative_subject(finite=after is Tag.PRONOUN or before is Tag.INDEFINITE or not gives)
         if self._after_modal and self._subject_is_object():
             self._require(verbs.verb_base(word) or word)
+        elif verbs.base_of_ed(word) in _PLACING and self._asks_for_state():
+            buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
         elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
             pass  # "the coffee went cold"
         elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN and before is not Tag.AUXILIARY:
@@ -140,6 +145,18 @@ class VerbChunker:
             else:
                 buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
         self._after_modal = False
+
+    def _asks_for_state(self) -> bool:
+        """Return True after "can I have the chairs", "I want the chairs", and "get the chairs" with "into"."""
+        buffer, at = self._buffer, self._buffer.index - 1
+        while at > 0 and buffer.tagged[at][1] in _OBJECT_PHRASE_TAGS:
+            at -= 1
+        verb, before = buffer.tagged[at][0], [("", None), ("", None), *buffer.tagged[:at]][-2:]
+        if verb == "get" or at == buffer.index - 1:
+            return at < buffer.index - 1 and PREPOSITIONS.get(buffer.word(1)) == "to"
+        asked = before[0][1] is Tag.AUXILIARY and before[0][0] not in _DO_FORMS
+        states = before[1][1] in SUBJECT_TAGS and not asked  # "I have boxes stacked"
+        return verb in WISHES or (verb == "have" and not states)
 
     def _require(self, base: str) -> None:
         """Emit the verb of "the box must be moved"; of "no box may be moved", negate it before its subject."""
@@ -205,7 +222,6 @@ class VerbChunker:
 _DEMONSTRATIVES: Final = word_set("this that these those")
 # "go around the table to the sofa": the table is a waypoint, the sofa the goal
 _ROUTE_RELATIONS: Final = word_set("near past above")
-_DO_FORMS: Final = word_set("do does did")
 # "the drawer open", "is empty"
 _BEFORE_STATE_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.AUXILIARY})
 # tags before a preposition that states where something is, not where to put it

@@ -361,6 +361,7 @@ class GraphBuilder:
         elif noun.head in lexicon.PLACES and pending is None:
             self._draft.whole_place = noun.text
         self._clause.inherited_preposition = pending if of_follows else None
+        self._clause.inherits_goal = pending == "to" and not of_follows  # "to the spot behind the truck"
         self._clause.skip_of_phrase, self._clause.inherited_conjoined = of_follows, conjoined
 
     def _negate_latest(self) -> None:

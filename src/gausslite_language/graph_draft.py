@@ -171,7 +171,7 @@ class Clause:
     precedes the latest noun. describes: an indefinite noun after "with" does. crosses: the way crosses a place.
     by_pronoun: the objects come from "it".
     adds_place: the preposition follows a conjunction. route: the clause mentions a path. skip_of_phrase: the next "of"
-    continues a noun that names no object.
+    continues a noun that names no object. inherits_goal: the place that follows says where the goal is.
     """
 
     def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
@@ -200,6 +200,7 @@ class Clause:
         self.skip_of_phrase = False
         self.inherited_conjoined = False
         self.inherited_preposition: str | None = None
+        self.inherits_goal = False
         self.nouns_since_negation = 0
         self.verb_since_negation = False
 

@@ -249,6 +249,24 @@ def test_pronouns_refer_to_named_objects(text, relations):
     assert graph.warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("text", "role"),
+    [
+        ("Carry the crate to my spot behind the truck", "destination"),
+        ("Carry the crate to the left of the truck", "destination"),
+        ("Carry the crate that is to the left of the truck", None),
+        ("Can I have the crates stacked near the truck", "destination"),
+        ("Do you have any crates stacked near the truck", None),
+        ("Get the crates loaded onto the truck", "destination"),
+        ("Get the crates stacked near the truck", None),
+    ],
+)
+def test_where_a_moved_thing_ends_is_a_destination(text, role):
+    graph = RuleParser().parse(text)
+    assert dict(zip(graph.targets, graph.roles, strict=True)).get("truck") == role
+    assert bool(graph.relations) == (role is None)
+
+
 @pytest.mark.parametrize("predicate", sorted(set(Predicate) - {Predicate.BETWEEN}))
 def test_every_predicate_has_a_preposition(predicate):
     graph = RuleParser().parse(f"Find the mug {predicate.replace('_', ' ')} the table")
