@@ -18,10 +18,11 @@ from gausslite_language.clause_types import (
     is_question_subject,
 )
 from gausslite_language.correction import apply_corrections
-from gausslite_language.lexicon import ORDINALS, is_attribute, word_set
+from gausslite_language.lexicon import is_attribute, is_ordinal, singular, word_set
 from gausslite_language.negation import HAVE_FORMS, NOUN_PHRASE_TAGS, OBJECT_START_TAGS, chunk_negation
-from gausslite_language.tags import Tag, tag_words
-from gausslite_language.tokens import PREPOSITIONS, lexical_units, split_bounds
+from gausslite_language.nouns import is_kind_of
+from gausslite_language.tags import Tag
+from gausslite_language.tokens import PREPOSITIONS, split_bounds
 
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
@@ -111,6 +112,8 @@ class VerbChunker:
         can_start = can_start or (follows_verb and buffer.chunks[-1].word not in verbs.ASPECT_VERBS)
         if can_start and after in NOUN_PHRASE_TAGS and lexicon.ADJECTIVES.issuperset(buffer.words):
             buffer.words.append(word)  # "the leaking pipe"
+        elif buffer.words and before is Tag.NOUN and self._is_compound(verbs.base_of_ing(word)):
+            buffer.words.append(word)  # "the label printing table"
         elif (
             before is Tag.NOUN
             and verbs.base_of_ing(word) in _PASSING
@@ -123,6 +126,13 @@ class VerbChunker:
             self._gerund_after_noun(after)
         else:
             buffer.emit(ChunkKind.VERB, verbs.verb_base(word) or word, gerund=True)
+
+    def _is_compound(self, base: str | None) -> bool:
+        """Return True if a countable noun follows without a determiner, and the noun before is no animate being."""
+        noun, after = singular(self._buffer.words[-1]), self._buffer.word(1)
+        acts = base in verbs.HOLDING_VERBS | _PASSING or noun in lexicon.PEOPLE or is_kind_of(noun, "animal")
+        is_mass = singular(after) != after or is_kind_of(after, "liquid") or is_kind_of(after, "material")
+        return self._buffer.tag(1) is Tag.NOUN and not (is_mass or acts or is_kind_of(noun, "person"))
 
     def participle(self, word: str) -> None:
         """Handle a participle: an adjective, a required state, or a modifier of the noun before it."""
@@ -228,11 +238,6 @@ _BEFORE_STATE_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.AUXILIARY})
 _LOCATION_TAGS: Final = frozenset({Tag.AUXILIARY, Tag.RELATIVE, Tag.PARTICIPLE, Tag.GERUND, Tag.NEGATION})
 _OBSERVERS: Final = word_set("me you us")
 _THEY: Final = word_set("they he she")
-
-
-def chunk_sentence(text: str) -> list[Chunk]:
-    """Return the chunks of one normalised sentence, in order."""
-    return chunk_tagged(tag_words(lexical_units(text)))
 
 
 def chunk_tagged(tagged: Sequence[tuple[str, Tag]]) -> list[Chunk]:
@@ -344,7 +349,8 @@ class _Chunker:
             buffer.words = []
         buffer.close()
         buffer.has_determiner, buffer.determiner_at = True, buffer.index
-        if word in ORDINALS and buffer.tag(1) in NOUN_PHRASE_TAGS:
+        is_extreme = word == "most" and buffer.word(-1) == "the"
+        if is_extreme or (is_ordinal(word) and buffer.tag(1) in NOUN_PHRASE_TAGS):
             buffer.words.append(word)
 
     def _indefinite(self, word: str) -> None:

@@ -42,9 +42,8 @@ class GraphBuilder:
         self._negated = False
         self._corrects = False
         self._negated_objects: list[str] = []
-        self._partitive: tuple[NounPhrase, str | None, bool] | None = (
-            None  # "the largest" of "the largest of the boxes"
-        )
+        # "the largest" of "the largest of the boxes"
+        self._partitive: tuple[NounPhrase, str | None, bool] | None = None
         self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
         self._plurals: set[str] = set()
@@ -243,9 +242,8 @@ class GraphBuilder:
             self._clause.nouns_since_negation += 1
             return
         names_more = self._pending is None and after is not None and after.kind is ChunkKind.PREPOSITION
-        left = self._clause.verb in verbs.LEAVING_VERBS and bool(
-            self._draft.context
-        )  # "you are in a kitchen. leave it"
+        # "you are in a kitchen. leave it"
+        left = self._clause.verb in verbs.LEAVING_VERBS and bool(self._draft.context)
         if left or (self._clause.verb is None and self._pending is None) or (names_more and self._clause.objects):
             return  # "the tiles, especially those behind the toilet"
         self._draft.unnamed = self._draft.unnamed or word

@@ -183,26 +183,13 @@ class Clause:
         self.terms = RelationTerms("near")
         self.places: list[str] = []
         self.superlative: str | None = None
-        self.statement = False
-        self.conjoined = False
-        self.describes = False
-        self.crosses = False
-        self.is_alternative = False
-        self.is_part = False
-        self.between = False
-        self.in_space = False
+        self.statement = self.follows_statement = self.by_pronoun = self.conjoined = self.is_alternative = False
+        self.describes = self.crosses = self.route = self.is_part = self.between = self.in_space = False
+        self.adds_place = self.current_place = self.skip_of_phrase = self.inherited_conjoined = False
+        self.inherits_goal = self.verb_since_negation = False
         self.preposition = ""
-        self.adds_place = False
-        self.current_place = False
-        self.by_pronoun = False
-        self.follows_statement = False
-        self.route = False
-        self.skip_of_phrase = False
-        self.inherited_conjoined = False
         self.inherited_preposition: str | None = None
-        self.inherits_goal = False
         self.nouns_since_negation = 0
-        self.verb_since_negation = False
 
 
 class RelationAssigner:

@@ -443,7 +443,7 @@ class RoleAssigner:
             if pending == "from_inside" and not encloses and noun.head not in lexicon.ROOMS:
                 self._assign_waypoint(noun, conjoined=True)  # "out of the back door"
             return
-        if clause.verb is None and any(word in lexicon.ORDINALS for word in " ".join(clause.objects).split()):
+        if clause.verb is None and any(lexicon.is_ordinal(word) for word in " ".join(clause.objects).split()):
             return  # "the second chair from the window"
         relation = _ORIGIN_RELATIONS.get(pending, "inside" if encloses else "on")
         if clause.last_relation == "with":

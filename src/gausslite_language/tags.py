@@ -160,17 +160,16 @@ def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
 
 
 def _deny_gerunds(tagged: list[tuple[str, Tag]]) -> list[tuple[str, Tag]]:
-    """Return the words with the "avoid" of "avoid placing", and the "stop" of "stop placing", as negations.
-
-    "Stop driving at the gate" keeps its verb: the gate is where the robot stops.
-    """
+    """Return the words with "avoid" and "stop" before a gerund as negations, unlike "stop driving at the gate"."""
     read: list[tuple[str, Tag]] = []
-    for at, (word, tag) in enumerate(tagged):
-        following, place = [*tagged[at + 1 : at + 3], ("", tag), ("", tag)][:2]
-        stops_there = verbs.base_of_ing(following[0]) in verbs.GO_VERBS and place[1] is Tag.PREPOSITION
-        stops_there = stops_there and PREPOSITIONS.get(split_bounds(place[0])[0]) not in _ENTERED
+    ends = [("", Tag.CLAUSE_BREAK)] * 2
+    for (word, tag), (gerund, next_tag), (place, _) in zip(
+        tagged, [*tagged, *ends][1:], [*tagged, *ends][2:], strict=False
+    ):
+        relation = PREPOSITIONS.get(split_bounds(place)[0], "on")
+        stops_there = verbs.base_of_ing(gerund) in verbs.GO_VERBS and relation not in _ENTERED
         denies = word in _AVOIDS or (word in _STOPS and not stops_there)
-        if not denies or tag not in (Tag.VERB, Tag.GERUND) or following[1] is not Tag.GERUND:
+        if not denies or tag not in (Tag.VERB, Tag.GERUND) or next_tag is not Tag.GERUND:
             read.append((word, tag))
         elif read and read[-1][1] is Tag.NEGATION:
             read.pop()  # "do not stop wiping"

@@ -26,6 +26,7 @@ _MIN: Final = (
     r"at least|more than|over|above|beyond|a minimum of|min(?:imum)?|(?:further|farther)(?: away)? than|"
     r"outside(?: of)?|(?:no|not) (?:less|closer|nearer)(?: away)? than"
 )
+_LIMIT: Final = r"(?:at (?:least|most)|up to|(?:no|not) (?:more|less|fewer) than)"
 _ABOUT: Final = r"about|around|roughly|approximately|approx|some|exactly|nearly|almost|just|only|circa"
 # other prepositions that a distance can bound
 _BOUNDED: Final = (
@@ -138,6 +139,7 @@ _PLAIN: Final = {
     r"gets(?= \w+(?:ed|en|wn)\b)|(?:is|are) to be": "should be",
     r"(is|are|was|were|does|did|has|have|would|could|should|must|need)n't": r"\1 not",
     r"let's": "let us",
+    r"(left|right|top|bottom|upper|lower)[ -]most": r"\1most",
     r"^whose": "the",
     r",? ?(?:which|that) belongs? to (?:the |my )?[\w']+,?": "",
     r"belonging to": "of",
@@ -227,7 +229,7 @@ _PLAIN: Final = {
     r"((?:make|take) an? (?:\w+ )?(?:photo|picture|video|image|scan)) from": r"\1 of",
     r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
     r"(?:as|so) long as|provided(?: that)?": "if",
-    rf"(?:at (?:least|most)|up to|(?:no|not) (?:more|less|fewer) than)(?= {_VALUE} (?!{_UNIT}\b))": "",
+    rf"{_LIMIT} (?:once|twice)|(?:{_LIMIT} )?{_VALUE} times|{_LIMIT}(?= {_VALUE} (?!{_UNIT}\b))": "",
     r"[.,;] (?:location|position|place)(?: is)?:": "",
     r"after (?:that|this)(?= \w)": "then",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (

@@ -157,13 +157,9 @@ def test_daily_tasks(expected):
 
 
 FRAMES = [
-    "Clean the {}",
-    "Find the {} on the shelf",
-    "Bring me the red {} and the glorb",
-    "Where is the {}?",
-    "Is the {} under the shelf broken?",
-    "Put the {} next to the shelf",
-]
+    "Clean the {}", "Find the {} on the shelf", "Bring me the red {} and the glorb", "Where is the {}?",
+    "Is the {} under the shelf broken?", "Put the {} next to the shelf",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("at", range(len(FRAMES)))
@@ -190,12 +186,10 @@ def test_a_sentence_takes_less_than_10_ms():
 @pytest.mark.parametrize(
     ("text", "excluded"),
     [
-        ("Ignore people and map the chairs", "person"),
-        ("Map the chairs except the stool", "stool"),
-        ("Clean the desk but skip the laptop", "laptop"),
-        ("Harvest the tomatoes but leave the cucumbers", "cucumber"),
+        ("Ignore people and map the chairs", "person"), ("Map the chairs except the stool", "stool"),
+        ("Clean the desk but skip the laptop", "laptop"), ("Harvest the tomatoes but leave the cucumbers", "cucumber"),
     ],
-)
+)  # fmt: skip
 def test_excluded_objects_are_no_targets(text, excluded):
     graph = RuleParser().parse(text)
     assert excluded not in (*graph.targets, *graph.anchors)
@@ -222,12 +216,10 @@ def test_objects_not_to_be_touched_are_obstacles(text, obstacle):
 @pytest.mark.parametrize(
     ("text", "targets", "anchors"),
     [
-        ("Pick this up", ("object",), ()),
-        ("Put that on the tray", ("object", "tray"), ()),
-        ("Leave it on the porch", ("object", "porch"), ()),
-        ("Clean them", ("object",), ()),
+        ("Pick this up", ("object",), ()), ("Put that on the tray", ("object", "tray"), ()),
+        ("Leave it on the porch", ("object", "porch"), ()), ("Clean them", ("object",), ()),
     ],
-)
+)  # fmt: skip
 def test_a_demonstrative_means_any_object_with_a_warning(text, targets, anchors):
     graph = RuleParser().parse(text)
     assert (graph.targets, graph.anchors) == (targets, anchors)
@@ -333,16 +325,13 @@ def test_what_a_thing_is_kept_away_from_is_an_obstacle(text, obstacles):
 @pytest.mark.parametrize(
     ("phrase", "predicate", "min_m", "max_m"),
     [
-        ("1.5 m from", Predicate.NEAR, 1.5, 1.5),
-        ("no further than a metre from", Predicate.NEAR, None, 1.0),
-        ("within 2m of", Predicate.NEAR, None, 2.0),
-        ("at least two feet away from", Predicate.NEAR, 0.61, None),
+        ("1.5 m from", Predicate.NEAR, 1.5, 1.5), ("no further than a metre from", Predicate.NEAR, None, 1.0),
+        ("within 2m of", Predicate.NEAR, None, 2.0), ("at least two feet away from", Predicate.NEAR, 0.61, None),
         ("no closer than 30 cm to", Predicate.NEAR, 0.3, None),
-        ("between 1 and 2 metres from", Predicate.NEAR, 1.0, 2.0),
-        ("half a metre behind", Predicate.BEHIND, 0.5, 0.5),
+        ("between 1 and 2 metres from", Predicate.NEAR, 1.0, 2.0), ("half a metre behind", Predicate.BEHIND, 0.5, 0.5),
         ("less than 3 steps to the left of", Predicate.LEFT_OF, None, 2.25),
     ],
-)
+)  # fmt: skip
 def test_distances_bound_a_relation(phrase, predicate, min_m, max_m):
     graph = RuleParser().parse(f"Find the mug {phrase} the door")
     assert graph.relations == (Relation(predicate, "mug", "door", False, min_m, max_m),)
@@ -352,6 +341,8 @@ def test_distances_bound_a_relation(phrase, predicate, min_m, max_m):
     ("text", "word"),
     [
         ("Open the second drawer", "second"),
+        ("Open the 2nd drawer", "2nd"),
+        ("Take the most worn chair", "most"),
         ("Take the oldest box", "oldest"),
         ("Find the mug a few metres from the door", "door"),
         ("Find the mug within -3 metres of the door", "door"),
@@ -372,6 +363,7 @@ def test_what_is_not_understood_is_a_warning(text, word):
         ("grab teh mgu frm the tabel", "Grab the mug from the table", "'mgu' is read as 'mug'"),
         ("pls find teh vaze b4 the windw", "Find the vase before the window", "'vaze' is read as 'vase'"),
         ("clean dsk w/ the spnge", "Clean desk with the sponge", "'dsk' is read as 'desk'"),
+        ("whres the mug", "where is the mug", "'whres' is read as 'where is'"),
         ("Meet Jahne at the door", "Meet Jahne at the door", "'jahne' is no known noun: it may be misread"),
     ],
 )
@@ -388,6 +380,10 @@ def test_what_is_typed_in_a_hurry_is_read_with_a_warning(text, same, warning):
         ("There is a victim behind the wall. Go to the door.", ["victim", "wall"]),
         ("Bring me a bottle of water and a bar of soap", []),
         ("I am hungry, get me the apple", []),
+        ("Drive up to the ramp and bring the robot the cup", ["robot"]),
+        ("Robot, bring the cup", []),
+        ("Find the ball and carry the very fragile", ["fragile"]),
+        ("Inspect the pipe for cracks", []),
         ("The baby sleeps, so close the curtains because guests are coming", []),
     ],
 )
@@ -435,6 +431,20 @@ def test_the_validator_refuses_relations_between_unknown_nouns():
 def test_pictures_maps_and_lists_are_objects_where_the_robot_handles_them(text, targets, anchors):
     graph = RuleParser().parse(text)
     assert (graph.targets, graph.anchors) == (targets, anchors)
+
+
+@pytest.mark.parametrize(
+    ("text", "target"),
+    [
+        ("Check the label printing table", "label printing table"),
+        ("Find the pipe leaking water", "pipe"),
+        ("Find the man pushing carts", "man"),
+        ("Circle the table at least 3 times", "table"),
+        ("Take the right most table", "table"),
+    ],
+)
+def test_the_words_of_a_compound_are_one_name(text, target):
+    assert RuleParser().parse(text).targets == (target,)
 
 
 FOREIGN = (
