@@ -35,7 +35,6 @@ class RoleAssigner:
     def __init__(self, draft: GraphDraft) -> None:
         self._draft = draft
         self._relations = RelationAssigner(draft)
-
         self.rename = self._relations.rename
 
     @property
@@ -271,7 +270,8 @@ class RoleAssigner:
         moved = clause.verb not in verbs.LOOKING_VERBS | verbs.TOOL_VERBS | verbs.FETCHING_VERBS
         if clause.by_pronoun and moved and not clause.statement and pending in _DESTINATION_RELATIONS:
             return True  # "and line them up on the shelf"
-        shifts = clause.preposition.startswith("to the ") and clause.verb in _SHIFTING_VERBS  # "to the left of"
+        shifting = verbs.CARRY_VERBS if clause.preposition.endswith("side of") else _SHIFTING_VERBS
+        shifts = clause.preposition.startswith("to the ") and clause.verb in shifting  # "to the left of"
         pushes = (shifts or clause.verb in verbs.PUSHING_VERBS) and bool(clause.objects)
         are_objects = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
         # "push the ball between the cones", unlike "push the button next to the door"

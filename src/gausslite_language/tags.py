@@ -191,6 +191,7 @@ def is_adverb(word: str) -> bool:
 def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str]) -> Tag | None:
     """Return the tag that a word can only have between these neighbours; None if others are possible."""
     opens, is_place, is_open = before in _OPENERS, after in PREPOSITIONS, word not in _CLOSED
+    denying = _STOPS if is_open else _AVOIDS  # "stop moving boxes", "avoid touching"
     ends = not after or is_place or after == "and"
     stops = word in ("stop", "wait") and ends and _is_noun(before) and before not in lexicon.CONTAINERS
     commands = (
@@ -228,7 +229,7 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (word.endswith("ing") and named)
         or (word == "half" and after == "of"),  # "stand lamp"
         Tag.PREPOSITION: word == "outside" and after in lexicon.DETERMINERS,
-        Tag.GERUND: before in ("without", *_BE) and verbs.base_of_ing(word) is not None,
+        Tag.GERUND: verbs.base_of_ing(word) is not None and (before in ("without", *_BE) or before in denying),
         Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
         Tag.DETERMINER: word == "one" and after == "of",
     }
