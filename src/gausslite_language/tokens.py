@@ -249,10 +249,10 @@ _PLAIN: Final = {
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
-    r"(?:be|being) careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|"
-    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|avoid to|by no means|"
-    r"it is forbidden to|(?:you )?(?:need not|(?:do not|don't) (?:have|need) to|are not (?:allowed|permitted) to)|"
-    r"(?:under|in) no (?:circumstance|case)s?(?: should you)?": "do not",
+    r"(?:you )?(?:need not|(?:do not|don't) (?:have|need) to|are not (?:allowed|permitted) to)|it is forbidden to|"
+    r"(?:(?:refrain|abstain|desist|keep|hold back) from|hold off on|no more)(?= \w+ing\b)|tak(?:e|ing) care not to|"
+    r"(?:under|in) no (?:circumstance|case)s?(?: should you)?|(?:be|being) careful (?:not to|to not)|by no means|"
+    r"make sure (?:not to|you don't|to not)|there is no need (?:for you )?to|try not to|avoid to": "do not",
     r"^(\w+) nothing": r"do not \1 anything",
     r"(?:keep (?:your|the) )?(?:hands|fingers) (?:off|away from)": "do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",

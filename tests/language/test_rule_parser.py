@@ -95,6 +95,7 @@ def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
         ("Stop stacking crates near the exit and stack them by the wall", "exit"),
         ("You should avoid driving on the lawn, go to the shed", "lawn"),
         ("Go to the gate avoiding people", "person"),
+        ("Hold off on opening the crate and open the drawer", "crate"),
         ("Make sure to avoid touching anything on the shelf while you dust the lamp", "object"),
     ],
 )
@@ -383,9 +384,8 @@ def test_what_is_typed_in_a_hurry_is_read_with_a_warning(text, same, warning):
         ("Bring me a bottle of water and a bar of soap", []),
         ("I am hungry, get me the apple", []),
         ("Drive up to the ramp and bring the robot the cup", ["robot"]),
-        ("Robot, bring the cup", []),
         ("Find the ball and carry the very fragile", ["fragile"]),
-        ("Inspect the pipe for cracks", []),
+        ("Robot, inspect the pipe for cracks", []),
         ("The baby sleeps, so close the curtains because guests are coming", []),
     ],
 )
