@@ -37,6 +37,7 @@ class Group(StrEnum):
     POSES = "gausslite.poses"  # refines the poses of views, or tracks the camera; the name is a value of `--poses`
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
+    MONITORS = "gausslite.monitors"  # judges whether a robot is where its odometry says, and finds a lost one
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     REFINERS = "gausslite.refiners"  # refines the fused map on keyframes
     KEYFRAME_SELECTIONS = "gausslite.keyframe_selections"  # chooses the keyframes that a robot sends

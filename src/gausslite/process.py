@@ -20,6 +20,8 @@ from gausslite.domain.errors import MissingPluginError
 
 # exit code of a command that did its work, while nothing of its task was found
 TASK_NOT_FOUND: Final = 3
+# exit code of a mission that does not know the robot's place at its end
+ROBOT_LOST: Final = 4
 
 
 def installed_version() -> str:

@@ -22,7 +22,6 @@ from gausslite.domain.recording import CameraCorrection, DepthRegistration, Pose
 from gausslite_calibration.camera_estimate import estimate_camera
 from gausslite_calibration.consistency import Contradiction, find_contradiction
 from gausslite_calibration.depth_registration import find_registration
-from gausslite_calibration.live_check import LiveCheck
 from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
 from gausslite_calibration.registered import RegisteredSource
 
@@ -92,11 +91,6 @@ def contradictions(source: Source) -> tuple[str, ...]:
         found = find_contradiction(source)
         return () if found is None else (str(found),)
     return ()
-
-
-def frame_check(in_background: bool) -> LiveCheck:
-    """Return a check of live frames."""
-    return LiveCheck(in_background)
 
 
 def _contradiction(source: Source, force: bool) -> Contradiction | None:

@@ -8,31 +8,19 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, downscaled_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import Trajectory, UpAxis, inverse, rotation_angle_deg, translation_m
-from gausslite_calibration.consistency import Contradiction, find_contradiction, match_pair
+from gausslite.domain.pose import Trajectory, UpAxis, rotation_angle_deg, translation_m
+from gausslite_calibration.consistency import Contradiction, find_contradiction
 
 _WINDOW, _FIRST = 24, 12
 """Frames that are compared, and with how many the first comparison is made; the next follow after twice as many each,
 or after _FIRST more while frames are refused."""
 _LEAST_MOTION_M, _LEAST_MOTION_DEG, _LONGEST_REST_NS = 0.01, 0.5, 500_000_000
 """Frames of a robot at rest show nothing: within these of the last frame that is compared, a frame is left out."""
-_JUMP_RATIO, _LEAST_JUMP_M, _LEAST_JUMP_DEG = 4.0, 0.3, 15.0
-"""A step of the poses this much longer than the median, and this long, is compared with the images at once. Odometry
-that slips by less is refined, and corrected at loops."""
-_MIN_STEPS, _MAX_STEPS = 6, 30
-_SAME_PLACE_M, _SAME_PLACE_DEG = 0.2, 8.0
-"""Poses that differ less from those by the images agree again: a jump is measured to a few centimetres."""
-_HELD = (
-    "nothing is added to the map until they jump back; to go on, end the mission and continue its map with --prior, "
-    "which recognises the place"
-)
 _ADVICE = (
     "expected T_world_camera (camera to world; camera axes x right, y down, z forward), depth in metres along the "
     "optical axis and the camera's own intrinsics; correct what is sent, or map it as it is with --set force=true"
@@ -81,10 +69,6 @@ class LiveCheck:
         self._comparing: Future[Contradiction | None] | None = None
         self._refusal = ""
         self._note = ""
-        self._steps: deque[tuple[float, float]] = deque(maxlen=_MAX_STEPS)
-        self._last: Frame | None = None
-        # from the poses to those that the images show since the last jump
-        self._offset = np.eye(4)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -93,10 +77,7 @@ class LiveCheck:
 
     def refusal(self, frame: Frame) -> str:
         """Return why poses or depth contradict the images; empty if they do not, or are not compared yet."""
-        small = _small(frame)
-        if jump := self._jump(small):
-            return jump
-        self._keep(small)
+        self._keep(compared(frame))
         if self._comparing is None and self._kept >= self._next:
             self._compare()
         if self._comparing is not None and self._comparing.done():
@@ -104,46 +85,19 @@ class LiveCheck:
             self._apply(found)
         return self._refusal
 
+    def restart(self) -> None:
+        """Compare the next frames with none of the earlier ones."""
+        self._window.clear()
+        self._kept, self._next = 0, _FIRST
+
     def _keep(self, frame: Frame) -> None:
         """Add a frame to the window if it may show something new; a new camera or clock begins another window."""
-        last = self._window[-1] if self._window else None
-        if last is not None and not _is_later(last, frame):
-            self._window.clear()
-            self._kept, self._next, last = 0, _FIRST, None
-        if last is not None and _at_rest(last, frame):
+        if self._window and not _is_later(self._window[-1], frame):
+            self.restart()
+        if self._window and _at_rest(self._window[-1], frame):
             return
         self._kept += 1
         self._window.append(frame)
-
-    def _jump(self, frame: Frame) -> str:
-        """Return why frames are held after a jump of the poses that the images do not show; empty without one.
-
-        A jump back to the odometry's frame from before, as of a localisation that recovers, ends the hold.
-        """
-        last, self._last = self._last, frame
-        if last is None or not _is_later(last, frame):
-            self._offset = np.eye(4)
-            return ""
-        step = _motion(last.T_world_camera, frame.T_world_camera)
-        is_long = len(self._steps) >= _MIN_STEPS and self._is_long(step)
-        self._steps.append(step)
-        pair = match_pair(FrameWindow((last, frame)), 0, 1) if is_long else None
-        if pair is not None and pair.contradicts(inverse(frame.T_world_camera) @ last.T_world_camera):
-            shown = pair.matched.T_current_reference
-            self._offset = self._offset @ last.T_world_camera @ inverse(shown) @ inverse(frame.T_world_camera)
-            stated = f"from frame {last.index} to {frame.index} by {step[0]:.2f} m and {step[1]:.0f} deg"
-            shown_m = np.linalg.norm(shown[:3, 3])
-            self._note = f"poses jump {stated}, the images show {shown_m:.2f} m" + (f"; {_HELD}" * self._is_away(frame))
-        return self._note if self._is_away(frame) else ""
-
-    def _is_away(self, frame: Frame) -> bool:
-        """True if the pose is another one than by the images since before the first jump."""
-        moved_m, turned_deg = _motion(self._offset @ frame.T_world_camera, frame.T_world_camera)
-        return moved_m > _SAME_PLACE_M or turned_deg > _SAME_PLACE_DEG
-
-    def _is_long(self, step: tuple[float, float]) -> bool:
-        longest = _JUMP_RATIO * np.median(np.array(self._steps), axis=0)
-        return bool((step > np.maximum(longest, (_LEAST_JUMP_M, _LEAST_JUMP_DEG))).any())
 
     def _compare(self) -> None:
         window = FrameWindow(self._window)
@@ -163,7 +117,7 @@ class LiveCheck:
         self._note = self._refusal or (self._note if found is None else str(found))
 
 
-def _small(frame: Frame) -> Frame:
+def compared(frame: Frame) -> Frame:
     """Return the frame in the size that comparisons ask for."""
     image = RgbdImage(frame.rgb, frame.depth_m, frame.camera)
     return replace(resize_rgbd(image, downscaled_size(frame.camera)).in_frame(frame), recorded_rgb=None)
@@ -174,12 +128,8 @@ def _is_later(last: Frame, frame: Frame) -> bool:
     return last.camera == frame.camera and frame.capture_time_ns >= last.capture_time_ns
 
 
-def _motion(a: Float64[ndarray, "4 4"], b: Float64[ndarray, "4 4"]) -> tuple[float, float]:
-    """Return the distance in metres and the angle in degrees between two poses."""
-    return translation_m(a, b), rotation_angle_deg(a, b)
-
-
 def _at_rest(last: Frame, frame: Frame) -> bool:
-    moved_m, turned_deg = _motion(last.T_world_camera, frame.T_world_camera)
+    moved_m = translation_m(last.T_world_camera, frame.T_world_camera)
+    turned_deg = rotation_angle_deg(last.T_world_camera, frame.T_world_camera)
     waited_ns = frame.capture_time_ns - last.capture_time_ns
     return moved_m < _LEAST_MOTION_M and turned_deg < _LEAST_MOTION_DEG and waited_ns < _LONGEST_REST_NS

@@ -25,6 +25,7 @@ from gausslite.wire.convert_task import object_from_message
 from gausslite_link.map_follower import FollowedMap, MapFollower
 
 _STATES = {number: name.removeprefix("AGENT_STATE_").lower() for name, number in pb.AgentState.items()}
+_LOCALISATIONS = {number: name.removeprefix("LOCALISATION_").lower() for name, number in pb.Localisation.items()}
 _FRAMES = tuple(f"frames_{outcome}" for outcome in ("mapped", "skipped", "dropped", "rejected"))
 _FIGURES = ("agent_id", "gaussians", *_FRAMES, "hz", "roi_share")
 
@@ -32,6 +33,7 @@ _FIGURES = ("agent_id", "gaussians", *_FRAMES, "hz", "roi_share")
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentSnapshot:
     """state: "mapping", "draining", "ended" ... as in AgentState. T_map_odometry: None before the first mapped frame.
+    localisation: "tracked", "doubtful" or "lost".
 
     problem: why the agent's uplink stopped for good; empty while it runs.
     """
@@ -50,6 +52,7 @@ class AgentSnapshot:
     problem: str
     notes: tuple[str, ...]
     T_map_odometry: Float64[ndarray, "4 4"] | None
+    localisation: str
     objects: tuple[ObjectLandmark, ...]
 
     @classmethod
@@ -68,6 +71,7 @@ class AgentSnapshot:
             problem=message.uplink.stopped_because,
             notes=tuple(message.notes),
             T_map_odometry=T_map_odometry,
+            localisation=_LOCALISATIONS.get(message.localisation, "unknown"),
             objects=tuple(object_from_message(landmark) for landmark in message.objects),
         )
 

@@ -16,7 +16,7 @@ from gausslite.config.values import read_path
 from gausslite.domain.checks import require_identifier
 from gausslite.domain.errors import MismatchError
 from gausslite.mission.results import MAP_FILE, prepare_file
-from gausslite.process import TASK_NOT_FOUND, size_text
+from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, size_text
 from gausslite.wire.channel import is_agent, require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient
 from gausslite.wire.convert import message_to_values
@@ -207,13 +207,16 @@ def run_status(options: argparse.Namespace) -> int:
         print(json.dumps(values))
     else:
         print("\n".join((_agent_lines if of_agent else _fusion_lines)(values)))
+    if of_agent and values["localisation"] == "LOCALISATION_LOST":
+        return ROBOT_LOST
     has_searched = of_agent and "graph" in values and int(values["frames_mapped"]) > 0
     return TASK_NOT_FOUND if has_searched and values["roi_share"] == 0 else 0
 
 
 def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:
     state = status["state"].removeprefix(_STATE_PREFIX).replace("_", " ").lower()
-    yield f"agent {status['agent_id']}: {state}"
+    place = status["localisation"].removeprefix("LOCALISATION_").lower()
+    yield f"agent {status['agent_id']}: {state}{f'; the robot is {place}' if place in ('doubtful', 'lost') else ''}"
     if "graph" in status:
         yield f"task       {status['graph']['text']}"
     yield (

@@ -117,17 +117,18 @@ class SequenceLocaliser:
         """True if the motion is found, or no more frames are to be tried."""
         return self.T_map_sequence is not None or self.tried >= MAX_LOCALISED_FRAMES
 
-    def offer(self, frame: Frame) -> None:
-        """Localise a frame; its own pose is in the sequence's frame."""
+    def offer(self, frame: Frame) -> bool:
+        """Localise a frame, whose own pose is in the sequence's frame; False if it is not recognised."""
         self.tried += 1
         place = self._places.localise(frame)
         if place is None:
-            return
+            return False
         motion = place.T_world_camera @ inverse(frame.T_world_camera)
         self._motions.append(motion)
         agreeing = sum(_agree(other, motion, frame) for other in self._motions)
         if agreeing - (len(self._motions) - agreeing) >= _NEEDED:
             self.T_map_sequence = motion
+        return True
 
     def localise(self, frames: Iterable[Frame]) -> Float64[ndarray, "4 4"] | None:
         """Offer frames until a motion is found, and return it; None if it is not."""

@@ -128,7 +128,7 @@ def register(source: Surface, target: Surface, guess: Float64[ndarray, "4 4"] | 
 def matched_motion(
     source: Surface, target: Surface, min_inliers: int = _MIN_MATCHER_INLIERS
 ) -> Float64[ndarray, "4 4"] | None:
-    """Return T_target_source from matches of point features; None with too few consistent ones."""
+    """Return T_target_source from matches of point features; None with too few samples, or consistent matches."""
     kiss_matcher = import_extra("kiss_matcher", "slam", "registration without a guess")
     spacing_m = max(source.spacing_m, target.spacing_m)
     # features of points compare only at equal spacing
@@ -136,6 +136,9 @@ def matched_motion(
         surface if surface.spacing_m == spacing_m else Surface.sampled(surface.points_m, spacing_m)
         for surface in (source, target)
     )
+    # kiss-matcher crashes on a few points
+    if min(len(source), len(target)) < _MIN_SAMPLES:
+        return None
     config = kiss_matcher.KISSMatcherConfig(voxel_size=spacing_m, use_voxel_sampling=False)
     matcher = kiss_matcher.KISSMatcher(config)
     found = matcher.estimate(list(source.points_m.astype(np.float32)), list(target.points_m.astype(np.float32)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Num
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, CameraMotion
@@ -111,8 +111,7 @@ class _Residuals:
         rendered_m = rendering.depth_m / np.maximum(rendering.alpha, np.float32(_OPAQUE_ALPHA))
         limit_m = np.maximum(np.float32(_MAX_DEPTH_SHARE) * photograph.depth_m, np.float32(1e-3))
         rendered, recorded = (
-            cv2.GaussianBlur(rgb @ _LUMINANCE, (0, 0), _BLUR_PX)
-            for rgb in (np.float32(255.0) * np.clip(rendering.rgb, 0.0, 1.0), photograph.rgb)
+            blurred_luminance(rgb) for rgb in (np.float32(255.0) * np.clip(rendering.rgb, 0.0, 1.0), photograph.rgb)
         )
         difference = rendered - recorded
         if compared.any():
@@ -138,7 +137,7 @@ def verify(render: RenderMap, frame: Frame, T_world_camera: Float64[ndarray, "4 
     if covered < _MIN_COVERED:
         return Verification(T, covered)
     agreement = float((found.depth[found.compared] < 1.0).mean())
-    texture = _texture_correlation(found, photograph)
+    texture = texture_correlation(found.rendered, blurred_luminance(photograph.rgb), found.compared)
     chroma, layout = _compare_colours(rendering, photograph, found.compared)
     verification = Verification(T, covered, agreement, texture, chroma, layout)
     if not verification.shows_the_same:
@@ -173,10 +172,17 @@ def _refined(
     return T_world_camera, rendering
 
 
-def _texture_correlation(found: _Residuals, photograph: Frame) -> float:
-    """Return the correlation of both luminances about their means in each cell."""
-    recorded = cv2.GaussianBlur(photograph.rgb @ _LUMINANCE, (0, 0), _BLUR_PX)
-    compared = found.compared.astype(np.float32)
+def blurred_luminance(rgb: Num[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    """Return the luminance of colours from 0 to 255, from 0 to 1, as `texture_correlation` compares it."""
+    blurred: Float32[ndarray, "h w"] = cv2.GaussianBlur(rgb @ _LUMINANCE, (0, 0), _BLUR_PX)
+    return blurred
+
+
+def texture_correlation(
+    rendered: Float32[ndarray, "h w"], recorded: Float32[ndarray, "h w"], pixels: Bool[ndarray, "h w"]
+) -> float:
+    """Return the correlation of two luminances about their means in each cell, over these pixels."""
+    compared = pixels.astype(np.float32)
     counts = _cell_sums(compared)
     enough = counts >= _MIN_CELL_PX
 
@@ -186,8 +192,8 @@ def _texture_correlation(found: _Residuals, photograph: Frame) -> float:
         )
         return float(sums[enough].sum())
 
-    spread = covariance(recorded, recorded) * covariance(found.rendered, found.rendered)
-    return covariance(recorded, found.rendered) / float(np.sqrt(max(spread, 1e-12)))
+    spread = covariance(recorded, recorded) * covariance(rendered, rendered)
+    return covariance(recorded, rendered) / float(np.sqrt(max(spread, 1e-12)))
 
 
 def _compare_colours(rendering: Rendering, photograph: Frame, compared: Bool[ndarray, "h w"]) -> tuple[float, float]:

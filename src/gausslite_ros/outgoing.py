@@ -90,10 +90,12 @@ def diagnostics(
     else:
         failed = snapshot.state == "failed" or bool(snapshot.problem)
         problems += [snapshot.problem] if snapshot.problem else []
+        problems += [f"the robot's place is {snapshot.localisation}"] * (snapshot.localisation in ("doubtful", "lost"))
         level = ERROR if failed else WARN if problems else OK
         message = f"{snapshot.state}: {problems[0]}" if problems else snapshot.state
         values = {
             "agent": snapshot.agent_id,
+            "localisation": snapshot.localisation,
             "task": snapshot.task,
             "gaussians": snapshot.gaussians,
             "frames mapped": snapshot.frames_mapped,

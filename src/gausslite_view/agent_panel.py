@@ -102,7 +102,10 @@ class AgentPanel:
 def _status_lines(status: Any) -> Iterator[str]:
     descriptor = status.DESCRIPTOR.fields_by_name["state"].enum_type.values_by_number
     state = descriptor[status.state].name.removeprefix(_STATE_PREFIX) if status.state in descriptor else "UNKNOWN"
-    yield f"{status.agent_id}: {state.replace('_', ' ').lower()}"
+    places = status.DESCRIPTOR.fields_by_name["localisation"].enum_type.values_by_number
+    place = places[status.localisation].name.removeprefix("LOCALISATION_").lower()
+    shown = f"; the robot is {place}" if place in ("doubtful", "lost") else ""
+    yield f"{status.agent_id}: {state.replace('_', ' ').lower()}{shown}"
     if status.graph.text:
         yield f"task: {status.graph.text}"
     yield (

@@ -14,7 +14,7 @@ from gausslite_bench.team.scenes import HomeTeamPlan
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
-WITHOUT_OUTPUT = ("chaos", "fuzz", "raster", "server")
+WITHOUT_OUTPUT = ("chaos", "fuzz", "kidnaps", "raster", "server")
 
 
 @pytest.mark.parametrize(
@@ -22,6 +22,8 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "raster", "server")
     [
         (("chaos", "--kills", "0"), "--kills"),
         (("chaos", "--agents", "33"), "--agents"),
+        (("kidnaps", "--events", "flood"), "--events: expected some of none, seen"),
+        (("kidnaps", "--frames", "110"), "expected at least 126 frames, got 120"),
         (("fuzz", "--corpus", "."), "expected folders of messages"),
         (("quality", "--policies", "best"), "policy: expected one of gaussian-slam"),
         (("quality", "--pairs", "home-0"), "pairs: expected names such as home-3"),

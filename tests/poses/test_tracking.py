@@ -16,6 +16,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.domain.state import select_prefix
 from gausslite.mission.build import build_mapper, build_tracker
+from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
@@ -127,11 +128,13 @@ def test_a_lost_camera_is_reported_and_found_again() -> None:
     outcome = mapper.process(replace(covered, index=16))
     assert outcome.skipped is not None
     assert "lost" in outcome.skipped
+    assert outcome.localisation is LocalisationState.LOST
     assert len(mapper.poses) == count
     assert mapper.tracking_counts["lost"] == 1
     # the camera returns to another place that the map shows
     back = replace(without_pose(walk()[4]), index=17, capture_time_ns=walk()[17].capture_time_ns)
     assert mapper.process(back).skipped is None
+    assert mapper.localisation is LocalisationState.TRACKED
     assert mapper.tracking_counts["relocalisation"] == 1
     found = mapper.poses.trajectory().T_world_camera[-1]
     assert translation_m(found, walk()[4].T_world_camera) < 0.1

@@ -43,7 +43,7 @@ MUG = ObjectLandmark(
     "1", "mug", ObjectRole.TARGET, (1.0, 2.0, 0.5), AxisAlignedBox((0.9, 1.9, 0.4), (1.1, 2.1, 0.6)), 0.8, 0, 1
 )
 PUBLICATIONS = publications(PARAMETERS)
-SNAPSHOT = AgentSnapshot("husky", "mapping", TASK, 10, 3, 0, 0, 0, 4.0, 0.1, 0.2, "", (), np.eye(4), (MUG,))
+SNAPSHOT = AgentSnapshot("husky", "mapping", TASK, 10, 3, 0, 0, 0, 4.0, 0.1, 0.2, "", (), np.eye(4), "tracked", (MUG,))
 
 
 @contextmanager

@@ -54,7 +54,7 @@ def write_run(folder: Path, world_frame: str = "room", frame: int = 3, **report:
     rows = format_pose_rows("T_map_camera", np.arange(3, dtype=np.int64), poses)
     (folder / "trajectory.txt").write_text(rows)
     (folder / "frames.csv").write_text(
-        "frame,seconds,iterations,gaussians,roi_share\n0,0.5,8,100,0.1\n1,0.4,8,357,0.2\n"
+        "frame,seconds,iterations,gaussians,roi_share,localisation\n0,0.5,8,100,0.1,0\n1,0.4,8,357,0.2,0\n"
     )
     return folder
 

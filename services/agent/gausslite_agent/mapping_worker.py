@@ -29,9 +29,10 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
-from gausslite.mission.build import EstimatorBuilder, build_check, build_mapper, build_tracker
+from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker, open_monitor
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
+from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
@@ -279,7 +280,7 @@ class MappingWorker:
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
                 tracker=build_tracker(self._settings, self._mapper),
-                check=build_check(self._settings, in_background=True),
+                monitor=open_monitor(self._settings, self.prior, in_background=True),
             )
         elif current is None or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign
@@ -320,10 +321,12 @@ class MappingWorker:
         assert self._task_mapper is not None
         frame = self._place(queued.frame)
         if frame is None:
+            self._status.update(localisation=LocalisationState.LOST)
             self._update_notes((LOCALISING,))
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index
+        self._status.update(localisation=self._task_mapper.localisation)
         self._update_notes(self._task_mapper.notes)
         self._update_objects(self._task_mapper.objects)
         if outcome.skipped is not None:

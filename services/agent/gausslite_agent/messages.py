@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
@@ -13,6 +14,7 @@ from gausslite_agent.state import FrameReport, MissionState, MissionSummary, Out
 
 _STATES = enum_numbers(pb.AgentState, MissionState)
 _OUTCOMES = enum_numbers(pb.FrameOutcome, Outcome)
+_LOCALISATIONS = enum_numbers(pb.Localisation, LocalisationState)
 
 
 def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
@@ -51,6 +53,7 @@ def status_to_message(
         age_p50_seconds=status.age_s(50),
         age_p99_seconds=status.age_s(99),
         map_to_odom=_correction_to_message(status),
+        localisation=_LOCALISATIONS[status.localisation],
         objects=[object_to_message(landmark) for landmark in status.objects],
         notes=(*mission.notes, *status.noun_notes, *status.notes, *status.task_notes, *status.load_notes),
     )

@@ -51,6 +51,7 @@ def mission_report(
     return {
         "agent_id": agent_id,
         "task": "" if graph is None else graph.text,
+        "localisation": status.localisation.name.lower(),
         "targets": [] if graph is None else list(graph.targets),
         "task_graph": None if graph is None else graph_as_json(graph),
         "frames": status.mapped,

@@ -18,12 +18,14 @@ from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.build import EstimatorFactory
+from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.plan import RunPlan
 from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.pages import load_pages
+from gausslite.process import ROBOT_LOST
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.run_service import run_service
 from gausslite.wire.server import serve_until_stopped
@@ -118,7 +120,8 @@ class PeriodicSave:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the agent and return its exit code.
 
-    1 if data that no spool keeps was not sent, 2 with one line on stderr for an error the operator can fix, else 0.
+    1 if data that no spool keeps was not sent, 4 if the robot was lost at the end, 2 with one line on stderr for an
+    error the operator can fix, else 0.
     """
 
     async def serve() -> int:
@@ -174,7 +177,9 @@ async def _serve(settings: AgentSettings) -> int:
         lost = mission.describe_lost_data()
         if lost:
             _log.error("%s", lost)
-        return 1 if lost else 0
+        if lost:
+            return 1
+        return ROBOT_LOST if worker.status().localisation is LocalisationState.LOST else 0
 
 
 def _require_usable(settings: AgentSettings) -> None:

@@ -19,6 +19,7 @@ from gausslite.domain.state import State, encode_text, get_array, get_counts, ge
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.training import SkippableStage
 from gausslite.mission.checkpoint import SavedRun
+from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.process import size_text
 from gausslite.v1 import task_pb2
@@ -216,7 +217,7 @@ class WorkerStatus:
     keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
     latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
     notes: messages of the relevance estimator. objects: the confirmed objects of the task. nouns: what is searched for
-    each noun, and what was detected. team_gaussians: Gaussians inserted from the fused map.
+    each noun, and what was detected. team_gaussians: Gaussians inserted from the fused map. localisation: of the robot.
     """
 
     graph: TaskGraph | None = None
@@ -243,6 +244,7 @@ class WorkerStatus:
     objects: tuple[ObjectLandmark, ...] = ()
     nouns: tuple[NounReport, ...] = ()
     team_gaussians: int = 0
+    localisation: LocalisationState = LocalisationState.TRACKED
 
     @property
     def noun_notes(self) -> tuple[str, ...]:
@@ -318,7 +320,9 @@ class StatusHolder:
         """Count one frame; outcome: that of a mapped one."""
         with self._lock:
             if outcome is not None:
-                status = self.status.with_mapped(outcome, report.age_s)
+                status = replace(self.status, skipped=self.status.skipped + 1 - len(outcome.mapped))
+                for mapped in outcome.mapped:
+                    status = status.with_mapped(mapped, report.age_s)
             else:
                 kind = report.outcome.value
                 status = replace(self.status, **{kind: getattr(self.status, kind) + 1})

@@ -28,6 +28,7 @@ from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.evaluation import Evaluator, TrainingFit
+from gausslite.mission.localisation_monitor import UNPLACED, LocalisationState
 from gausslite.mission.plan import MappedRun, OpenRun, RunPlan
 from gausslite.mission.prior_map import compare_with_prior
 from gausslite.mission.recording import RecordingOptions, stated_values
@@ -55,7 +56,7 @@ from gausslite.mission.settings import (
 from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome
 from gausslite.pages import BeginView, load_pages
 from gausslite.plugins import Group, load
-from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt
+from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, DeferredInterrupt
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.channel import MAX_PORT
 
@@ -95,6 +96,7 @@ _SKIPS = {
     TOO_FAR: "too far",
     REPEATED: "repeated",
     TRACKING_LOST: "lost by tracking",
+    UNPLACED: "without a known place",
 }
 
 
@@ -233,6 +235,8 @@ def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome
         raise type(interrupt.pending_exception)(f"all frames are mapped, and all files are in {options.out}")
     if written is not None:
         _print_results(options, mapped, written)
+    if mapped.mapper.localisation is LocalisationState.LOST:
+        return ROBOT_LOST
     return 0 if mapped.has_found_task else TASK_NOT_FOUND
 
 
@@ -358,6 +362,8 @@ def _outcome(mapped: MappedRun, scores: TrainingFit | None) -> str:
         in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "
         views = f"{scores.n_views} training view{'s' if scores.n_views > 1 else ''}"
         parts.append(f"{views}: {in_region}{scores.full_psnr:.1f} dB in whole images")
+    if mapped.mapper.localisation is LocalisationState.LOST:
+        parts.append("the robot was lost at the end")
     return "; ".join(parts)
 
 

@@ -11,7 +11,6 @@ from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import MissingPluginError
-from gausslite.domain.frame import Frame
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, load
 
@@ -84,19 +83,6 @@ class Calibration:
     notes: tuple[str, ...] = ()
 
 
-class FrameCheck(Protocol):
-    """Compares frames that arrive one by one with each other, as `Calibrator.contradictions` compares a recording's."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """How poses or depth contradict the images, as messages for the operator."""
-        ...
-
-    def refusal(self, frame: Frame, /) -> str:
-        """Return why this frame should not be mapped; empty if it may. Call it for each frame."""
-        ...
-
-
 class Calibrator(Protocol):
     """Decides what neither the user nor the source states; the default of the group `gausslite.calibrators`."""
 
@@ -116,10 +102,6 @@ class Calibrator(Protocol):
 
     def contradictions(self, source: Source, /) -> tuple[str, ...]:
         """Return how poses or depth contradict the images, as messages for the operator."""
-        ...
-
-    def frame_check(self, in_background: bool, /) -> FrameCheck | None:
-        """Return a check of live frames, which delays none of them if in the background; None if nothing compares."""
         ...
 
 
@@ -150,10 +132,6 @@ class StatedOnly:
     def contradictions(self, _source: Source) -> tuple[str, ...]:
         """Return none: nothing is compared."""
         return ()
-
-    def frame_check(self, _in_background: bool) -> FrameCheck | None:
-        """Return None: nothing is compared."""
-        return None
 
 
 def open_calibrator() -> Calibrator:

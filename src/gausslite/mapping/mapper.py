@@ -135,18 +135,24 @@ class GaussianMapper:
         return self._revision
 
     def look(self, frame: Frame, scheduler: StageScheduler) -> FrameView:
-        """Return the frame without the things that move, and with the map rendered from its pose.
-
-        What has moved since an earlier keyframe is hidden there. If the scheduler skips seeding, the map is rendered
-        only for things that move.
-        """
-        moving = self._find_moving(frame)
-        if moving is None and (self.count == 0 or scheduler.skips(SkippableStage.SEEDING)):
+        """Return the frame with the map rendered from its pose, unless the scheduler skips seeding."""
+        if self.count == 0 or scheduler.skips(SkippableStage.SEEDING):
             return FrameView(frame)
         with scheduler.timing(Stage.RENDERING):
             rendering = self.render(frame.camera, frame.T_world_camera, frame.motion)
-            rendered = RenderedView.from_rendering(rendering) if self.count else None
-        return FrameView(frame if moving is None else without_pixels(frame, moving, rendering.rgb), rendered)
+            return FrameView(frame, RenderedView.from_rendering(rendering))
+
+    def leave_out_moving(self, view: FrameView, scheduler: StageScheduler) -> FrameView:
+        """Return the view without the things that move; what has moved since an earlier keyframe is hidden there."""
+        count, frame = self.count, view.frame
+        moving = self._find_moving(frame)
+        if view.rendered is None or self.count != count:
+            view = self.look(frame, scheduler)
+        if moving is None:
+            return view
+        with scheduler.timing(Stage.RENDERING):
+            seen = view.rendered or self.render(frame.camera, frame.T_world_camera, frame.motion)
+        return replace(view, frame=without_pixels(frame, moving, seen.rgb))
 
     def map_frame(self, frame: Frame, relevance: RelevanceMap, scheduler: StageScheduler | None = None) -> MappedFrame:
         """Map a frame as it is, with things that move; see `map_view`."""

@@ -38,15 +38,16 @@ _EDGE_EPSILON = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedView:
-    """The map rendered from a frame's pose: alpha in [0, 1], and expected depth in metres (0 where alpha is low)."""
+    """The map from a frame's pose: alpha in [0, 1], expected depth in metres (0 where alpha is low), and colours."""
 
     alpha: Float32[ndarray, "h w"]
     depth_m: Float32[ndarray, "h w"]
+    rgb: Float32[ndarray, "h w 3"]
 
     @classmethod
     def from_rendering(cls, rendering: Rendering) -> RenderedView:
         """Return alpha and expected depth of a rendering."""
-        return cls(rendering.alpha, rendering.expected_depth_m())
+        return cls(rendering.alpha, rendering.expected_depth_m(), rendering.rgb)
 
 
 def rendered_behind(frame: Frame, rendered: RenderedView, depth_error_factor: float) -> Bool[ndarray, "h w"]:

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from gausslite.datasets.calibration import FrameCheck, open_calibrator
 from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounMatch
@@ -17,6 +16,8 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
 from gausslite.mapping.pose_estimation import CameraTracker, open_tracker
 from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.mission.localisation_monitor import LocalisationMonitor
+from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.settings import LoopMode, MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.detector import Detector, RegionDetector
@@ -29,12 +30,15 @@ from gausslite.perception.relevance import (
     TaskRelevanceEstimator,
 )
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
-from gausslite.plugins import Group, load
+from gausslite.plugins import Group, find, load
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
+OpenMonitor = Callable[[PriorMap | None, bool | None], LocalisationMonitor]
+"""The plug-in of `gausslite.monitors`, with the earlier map that the mission continues, if any, and whether live frames
+are compared with each other in the background; None: a recording's frames, which were compared before."""
 
 
 def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> GaussianMapper:
@@ -72,10 +76,16 @@ def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTr
     return open_tracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
-def build_check(settings: MissionSettings, in_background: bool) -> FrameCheck | None:
-    """Return the check of live frames; None with `force`, and where their poses are not used."""
+def open_monitor(
+    settings: MissionSettings, prior: PriorMap | None = None, in_background: bool | None = None
+) -> LocalisationMonitor | None:
+    """Return what judges the place of each frame; None with `force`, where the camera is tracked, or without a plug-in.
+
+    in_background: see `OpenMonitor`.
+    """
     is_needed = settings.poses is not PoseMode.TRACK and not settings.force
-    return open_calibrator().frame_check(in_background) if is_needed else None
+    open_plugin: OpenMonitor | None = find(Group.MONITORS) if is_needed else None
+    return None if open_plugin is None else open_plugin(prior, in_background)
 
 
 def chosen_detector(perception: PerceptionSettings) -> Detector | None:
@@ -103,18 +113,17 @@ def build_task_mapper(
     settings: MissionSettings,
     estimators: EstimatorFactory,
     roi: TaskGraph | Sequence[Region],
-    prior: Gaussians | None = None,
-    check: FrameCheck | None = None,
+    earlier: Gaussians | None = None,
+    monitor: LocalisationMonitor | None = None,
 ) -> TaskMapper:
     """Return a mapper of an empty map, or of an earlier one. roi: a task, or regions of space; neither: uniform.
 
     Raises KernelError, QuotaError, and InvalidInputError for a task without a detector.
     """
     estimator = estimators.build(roi) if isinstance(roi, TaskGraph) else region_estimator(roi)
-    mapper = build_mapper(settings, prior)
-    scheduler = FrameScheduler(settings.scheduler_settings)
-    tracker = build_tracker(settings, mapper)
-    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=tracker, check=check)
+    mapper = build_mapper(settings, earlier)
+    scheduler, tracker = FrameScheduler(settings.scheduler_settings), build_tracker(settings, mapper)
+    return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=tracker, monitor=monitor)
 
 
 class EstimatorFactory:

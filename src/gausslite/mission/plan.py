@@ -21,7 +21,7 @@ from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text, get_text
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.mapping.splat_table import require_memory
-from gausslite.mission.build import EstimatorFactory, build_check, build_task_mapper
+from gausslite.mission.build import EstimatorFactory, build_task_mapper, open_monitor
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.recording import (
@@ -131,8 +131,8 @@ class RunPlan:
     def task_mapper(self, scene: SceneInfo) -> TaskMapper:
         """Return a mapper for other frames. Raises InvalidInputError, ModelFileError, KernelError."""
         models = EstimatorFactory(self.perception, lambda: scene)
-        roi, check = self.schedule.first or self.regions, build_check(self.mission, in_background=False)
-        return build_task_mapper(self.mission, models, roi, check=check)
+        roi, monitor = self.schedule.first or self.regions, open_monitor(self.mission, in_background=False)
+        return build_task_mapper(self.mission, models, roi, monitor=monitor)
 
     def _stated(self, source: Source, saved: SavedRun | None) -> StatedValues:
         """Return what is not to be estimated: also what a saved run has, and what needs poses that are not used."""
@@ -214,7 +214,8 @@ class RunPlan:
     ) -> ScheduledTaskMapper:
         """Return the mapper before its first frame, or as the saved run left it."""
         task = "" if self.schedule.first is None else self.schedule.first.text
-        mapper = build_task_mapper(self.mission, models, roi, None if prior is None else prior.gaussians_for(task))
+        earlier, monitor = None if prior is None else prior.gaussians_for(task), open_monitor(self.mission, prior)
+        mapper = build_task_mapper(self.mission, models, roi, earlier, monitor)
         if saved is not None:
             saved.restore(mapper)
         last_index = _NOT_RESUMED if saved is None else saved.last_index
@@ -328,6 +329,7 @@ class MappedRun:
             **trajectory,
             "targets": [] if graph is None else list(graph.targets),
             "loops": asdict(self.mapper.loops),
+            "localisation": self.mapper.localisation.name.lower(),
             "frames_corrupt": self.corrupt.count,
             "gaussians": len(self.gaussians),
             "active_gaussians": int(self.gaussians.active.sum()),

@@ -17,6 +17,7 @@ from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist
 from gausslite.domain.recording import CameraCorrection
+from gausslite.mission.localisation_monitor import UNPLACED
 from gausslite.mission.settings import SourceSettings
 from gausslite.mission.task_mapper import TRACKING_LOST, FrameOutcome
 from gausslite.process import DeferredInterrupt
@@ -141,6 +142,9 @@ class MissionTotals:
 
     def add(self, outcome: FrameOutcome) -> None:
         """Add one frame."""
+        for waited in outcome.recovered:
+            self.reasons[UNPLACED] -= 1
+            self.add(waited)
         self.keyframes_reevaluated += outcome.reevaluation.keyframes
         self.seeded_in_keyframes += outcome.reevaluation.seeded
         self.region_seen |= outcome.roi_share > 0

@@ -152,22 +152,23 @@ class ScheduledTaskMapper:
 
 
 _FILE = "frames.csv"
-COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share")
+COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share", "localisation")
+"""localisation: a value of `LocalisationState`."""
 _MAX_ROWS = 100_000
 
 
 @dataclass(slots=True)
 class Timeline:
-    """The rows of the mapped frames of one run; every second one is removed whenever there are max_rows."""
+    """The rows of frames with their place or without it; every second one is removed whenever there are max_rows."""
 
     max_rows: int = _MAX_ROWS
     _rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def add(self, outcome: FrameOutcome) -> None:
         """Add one frame."""
-        if outcome.skipped is None:
-            seconds = outcome.timing.seconds
-            self._rows.append((outcome.index, seconds, outcome.iterations, outcome.gaussians, outcome.roi_share))
+        for shown in outcome.mapped or (outcome,) * (outcome.localisation > 0):
+            figures = shown.index, shown.timing.seconds, shown.iterations, shown.gaussians, shown.roi_share
+            self._rows.append((*figures, shown.localisation))
         if len(self._rows) >= self.max_rows:
             del self._rows[1::2]
 

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from gausslite.datasets.calibration import FrameCheck
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -30,6 +29,7 @@ from gausslite.mapping.task_change import Reevaluation
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
+from gausslite.mission.localisation_monitor import UNPLACED, Admission, LocalisationMonitor, LocalisationState
 from gausslite.perception.pointing import PointedMask, pointed_masks
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 from gausslite.render.rasterizer import Rendering
@@ -52,6 +52,7 @@ class FrameOutcome:
     skipped: why the frame was not mapped, else None. changed_roi: the changed voxels of the task's region; None
     without a tracker, for a skipped frame, and if publishing waits for the next frame. detection_lag_frames: age of
     the detection that finished during this frame. reevaluation: the earlier keyframes evaluated for a new task.
+    recovered: outcomes of frames that waited for the robot's place and are mapped now, before this one.
     """
 
     index: int
@@ -63,6 +64,13 @@ class FrameOutcome:
     changed_roi: VoxelBatch | None = None
     detection_lag_frames: int | None = None
     reevaluation: Reevaluation = field(default_factory=Reevaluation)
+    localisation: LocalisationState = LocalisationState.TRACKED
+    recovered: tuple[FrameOutcome, ...] = ()
+
+    @property
+    def mapped(self) -> tuple[FrameOutcome, ...]:
+        """The outcomes of the frames that are mapped now, those that waited first."""
+        return tuple(outcome for outcome in (*self.recovered, self) if outcome.skipped is None)
 
 
 class LastImage:
@@ -104,19 +112,20 @@ class TaskMapper:
         scheduler: FrameScheduler | None = None,
         publish: Callable[[VoxelBatch], None] = lambda _batch: None,
         tracker: CameraTracker | None = None,
-        check: FrameCheck | None = None,
+        monitor: LocalisationMonitor | None = None,
     ) -> None:
         """Without a scheduler, each frame gets the fixed number of iterations of the mapper's settings.
 
         publish gets the changed voxels of each frame; its duration counts as part of the frame. Without a tracker,
-        frames are mapped with their own poses, unless the check refuses them.
+        frames are mapped with their own poses; without a monitor, wherever these are.
         """
         self._estimator = estimator
         self._mapper = mapper
         self._sent_voxels = sent_voxels
         self._scheduler = scheduler or FrameScheduler()
         self._publish = publish
-        self._tracker, self._check = tracker, check
+        self._tracker, self._monitor = tracker, monitor
+        self._tracked = LocalisationState.TRACKED
         self._detected: DetectedImage | None = None
         self._defects: dict[str, int] = {}
         self._last_image = LastImage()
@@ -154,8 +163,13 @@ class TaskMapper:
         defects = (
             f"frames are skipped in which {defect}; the first one is {index}" for defect, index in self._defects.items()
         )
-        refusals = () if self._check is None else self._check.notes
-        return (*self._estimator.notes, *refusals, *defects, *filter(None, [self._mapper.loops.describe()]))
+        places = () if self._monitor is None else self._monitor.notes
+        return (*self._estimator.notes, *defects, *places, *filter(None, [self._mapper.loops.describe()]))
+
+    @property
+    def localisation(self) -> LocalisationState:
+        """Whether the robot's place is known, by the monitor, or by tracking."""
+        return self._tracked if self._monitor is None else self._monitor.localisation
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -234,6 +248,7 @@ class TaskMapper:
             **add_prefix("sent_voxels", sent_voxels),
             **add_prefix("tracker", {} if self._tracker is None else self._tracker.state()),
             **add_prefix("last_image", self._last_image.state()),
+            **add_prefix("monitor", {} if self._monitor is None else self._monitor.state()),
         }
 
     def restore(self, state: State) -> None:
@@ -246,23 +261,43 @@ class TaskMapper:
         if self._tracker is not None:
             self._tracker.restore(select_prefix(state, "tracker"))
         self._last_image.restore(select_prefix(state, "last_image"))
+        if self._monitor is not None:
+            self._monitor.restore(select_prefix(state, "monitor"))
 
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.
 
-        A frame with a defect is skipped, one that the check refuses, one without a tracked pose, and one in which
-        everything moves.
+        A frame with a defect is skipped, one that the monitor refuses, one without a tracked pose, and one in which
+        everything moves. When the monitor has found the robot again, the frames that waited are mapped first.
         """
         self._scheduler.begin(waited_s)
         repeats = self._last_image.is_repeated_by(frame)
         if defect := frame.defect or (REPEATED if repeats else ""):
             return self._skip_defect(frame, defect)
-        if self._check is not None and (refusal := self._check.refusal(frame)):
-            return self._skip(frame, refusal)
+        admitted = Admission((frame,)) if self._monitor is None else self._monitor.admit(frame, self._mapper)
+        if not admitted.frames:
+            return self._skip(frame, admitted.reason)
+        if admitted.T_map_odometry is not None:
+            self._mapper.poses.T_corrected_odometry = admitted.T_map_odometry
+        recovered = []
+        for waiting in admitted.frames[:-1]:
+            recovered.append(self._process_placed(waiting))
+            self._scheduler.begin(0.0)
+        return replace(self._process_placed(frame), recovered=tuple(recovered))
+
+    def _process_placed(self, frame: Frame) -> FrameOutcome:
+        """Process a frame whose place is known."""
         posed = self._track(self._mapper.poses.add_odometry(frame))
+        self._tracked = LocalisationState.LOST if posed is None else LocalisationState.TRACKED
         if posed is None:
             return self._skip(frame, TRACKING_LOST)
-        view = self._mapper.look(posed, self._scheduler)
+        view = FrameView(posed)
+        if self._monitor is not None:
+            view = self._mapper.look(posed, self._scheduler)
+            # before anything that a frame shows to have moved is removed
+            if not self._monitor.confirm(posed, view):
+                return self._skip(frame, UNPLACED)
+        view = self._mapper.leave_out_moving(view, self._scheduler)
         if view.frame.defect:
             return self._skip_defect(frame, MOVING)
         estimate = self._estimate_relevance(view)
@@ -281,15 +316,14 @@ class TaskMapper:
             gaussians=mapped.gaussians,
             roi_share=estimate.relevance.roi_share,
             timing=self._scheduler.end(),
-            skipped=None,
             changed_roi=changed_roi,
             detection_lag_frames=lag_frames,
             reevaluation=reevaluation,
         )
 
     def idle_step(self) -> bool:
-        """Run one iteration while no frame waits. Return False if nothing has been mapped yet."""
-        return self._mapper.idle_step()
+        """Run one iteration while no frame waits. Return False if nothing is mapped, or if the robot is not tracked."""
+        return self.localisation is LocalisationState.TRACKED and self._mapper.idle_step()
 
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
@@ -324,7 +358,8 @@ class TaskMapper:
 
     def _skip(self, frame: Frame, reason: str) -> FrameOutcome:
         """Return the outcome of a frame that is not mapped."""
-        return FrameOutcome(frame.index, 0, self._mapper.count, 0.0, self._scheduler.end(), reason)
+        count, timing, localisation = self._mapper.count, self._scheduler.end(), self.localisation
+        return FrameOutcome(frame.index, 0, count, 0.0, timing, reason, localisation=localisation)
 
     def _estimate_relevance(self, view: FrameView) -> RelevanceEstimate:
         with self._scheduler.timing(Stage.RELEVANCE):

@@ -17,6 +17,7 @@ from gausslite_bench.cli.perception import configure_perception
 from gausslite_bench.cli.quality import configure_ablation, configure_compute, configure_quality
 from gausslite_bench.cli.team import configure_team
 from gausslite_bench.fuzz.run import FuzzSettings, run_fuzz
+from gausslite_bench.kidnaps import KidnapSettings, run_kidnaps
 from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, run_gpu, run_raster
 from gausslite_bench.report import Report
 from gausslite_bench.server.bench import ServerBenchSettings, run_server
@@ -63,6 +64,10 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
     "frames": (
         _Measurement(FrameAttackSettings, run_frame_attacks),
         "whom robots in wrong frames harm in a team",
+    ),
+    "kidnaps": (
+        _Measurement(KidnapSettings, run_kidnaps),
+        "a robot that is carried, covered or restarted in a recording",
     ),
     "fuzz": (_Measurement(FuzzSettings, run_fuzz), "mutated messages for the codec and every method of the services"),
 }

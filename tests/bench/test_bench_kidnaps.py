@@ -1,0 +1,23 @@
+"""The benchmark of lost robots: a robot that nobody watches is mapped at wrong poses, a watched one is not."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gausslite.cli.main import main
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_carried_robot_maps_nothing_wrong_only_if_it_is_watched(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("--frames", "24", "--after", "6", "--events", "seen,unseen,jump", "--json")
+    assert main(["bench", "kidnaps", *arguments]) == 0
+    rows = json.loads(capsys.readouterr().out)["events"]
+    watched, unwatched = ([row for row in rows if row["watched"] is flag] for flag in (True, False))
+    assert [(row["noticed"], row["wrong"], row["false_places"], row["false_alarms"]) for row in watched] == [
+        (0, 0, 0, 0)
+    ] * 3
+    assert [row["wrong"] for row in unwatched] == [6] * 3
+    assert [row["found"] for row in watched][1:] == [None, 0]
