@@ -13,7 +13,7 @@ from gausslite.domain.task import TaskParser
 from gausslite_language.models.parsers import AddingParser, CachedParser, FallbackParser, LanguageModel, LanguageParser
 from gausslite_language.rules import RuleParser
 
-_RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
+_FORMATS: Final = ("json_schema", "json_object", "none")
 _MODES: Final = ("parse", "add")
 
 
@@ -35,32 +35,20 @@ class ModelSettings:
     """
 
     model: str | None = option(
-        None,
-        "http: the model's name; onnx: a folder with genai_config.json",
-        key="llm-model",
-        metavar="NAME|FOLDER",
-        needs="backend=onnx|http",
+        None, "http: its name; onnx: its folder", key="llm-model", metavar="NAME|FOLDER", needs="backend=onnx|http"
     )
     url: str | None = option(
         None,
-        "base of an OpenAI-compatible server, http://localhost:8000/v1",
+        "an OpenAI-compatible server, http://localhost:8000/v1",
         key="llm-url",
         metavar="URL",
         needs="backend=http",
     )
     response_format: str = option(
-        _RESPONSE_FORMATS[0],
-        "response format to request",
-        key="llm-format",
-        choices=_RESPONSE_FORMATS,
-        needs="backend=http",
+        _FORMATS[0], "response format to request", key="llm-format", choices=_FORMATS, needs="backend=http"
     )
     mode: str = option(
-        _MODES[0],
-        "parse: the model parses; add: rules do, and the model only adds nouns that their graph lacks",
-        key="llm-mode",
-        choices=_MODES,
-        needs="backend=onnx|http",
+        _MODES[0], "add: the model only adds lost nouns", key="llm-mode", choices=_MODES, needs="backend=onnx|http"
     )
     timeout_s: float = 10.0
     key_variable: str = "GAUSSLITE_LLM_API_KEY"

@@ -18,16 +18,20 @@ from gausslite_language.clause_types import (
     is_question_subject,
 )
 from gausslite_language.correction import apply_corrections
-from gausslite_language.lexicon import ORDINALS, is_attribute, word_set
+from gausslite_language.lexicon import is_attribute, is_ordinal, singular, word_set
 from gausslite_language.negation import HAVE_FORMS, NOUN_PHRASE_TAGS, OBJECT_START_TAGS, chunk_negation
-from gausslite_language.tags import Tag, tag_words
-from gausslite_language.tokens import PREPOSITIONS, lexical_units, split_bounds
+from gausslite_language.nouns import is_kind_of
+from gausslite_language.tags import Tag
+from gausslite_language.tokens import PREPOSITIONS, split_bounds
 
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
 _OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
 _SUBJECT_KINDS: Final = (ChunkKind.NOUN, ChunkKind.PREPOSITION)
 _PERMISSIONS: Final = word_set("may can could")
+_PLACING: Final = verbs.DELIVERY_VERBS | verbs.GIVING_VERBS | verbs.FILLING_VERBS | verbs.PUSHING_VERBS
+_OBJECT_PHRASE_TAGS: Final = OBJECT_START_TAGS | {Tag.ANAPHOR}
+_DO_FORMS: Final = word_set("do does did")
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
 _BELONGING_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE})
@@ -108,6 +112,8 @@ class VerbChunker:
         can_start = can_start or (follows_verb and buffer.chunks[-1].word not in verbs.ASPECT_VERBS)
         if can_start and after in NOUN_PHRASE_TAGS and lexicon.ADJECTIVES.issuperset(buffer.words):
             buffer.words.append(word)  # "the leaking pipe"
+        elif buffer.words and before is Tag.NOUN and self._is_compound(verbs.base_of_ing(word)):
+            buffer.words.append(word)  # "the label printing table"
         elif (
             before is Tag.NOUN
             and verbs.base_of_ing(word) in _PASSING
@@ -121,6 +127,13 @@ class VerbChunker:
         else:
             buffer.emit(ChunkKind.VERB, verbs.verb_base(word) or word, gerund=True)
 
+    def _is_compound(self, base: str | None) -> bool:
+        """Return True if a countable noun follows without a determiner, and the noun before is no animate being."""
+        noun, after = singular(self._buffer.words[-1]), self._buffer.word(1)
+        acts = base in verbs.HOLDING_VERBS | _PASSING or noun in lexicon.PEOPLE or is_kind_of(noun, "animal")
+        is_mass = singular(after) != after or is_kind_of(after, "liquid") or is_kind_of(after, "material")
+        return self._buffer.tag(1) is Tag.NOUN and not (is_mass or acts or is_kind_of(noun, "person"))
+
     def participle(self, word: str) -> None:
         """Handle a participle: an adjective, a required state, or a modifier of the noun before it."""
         buffer = self._buffer
@@ -132,6 +145,8 @@ class VerbChunker:
         self._end_relative_subject(finite=after is Tag.PRONOUN or before is Tag.INDEFINITE or not gives)
         if self._after_modal and self._subject_is_object():
             self._require(verbs.verb_base(word) or word)
+        elif verbs.base_of_ed(word) in _PLACING and self._asks_for_state():
+            buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
         elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
             pass  # "the coffee went cold"
         elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN and before is not Tag.AUXILIARY:
@@ -140,6 +155,18 @@ class VerbChunker:
             else:
                 buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
         self._after_modal = False
+
+    def _asks_for_state(self) -> bool:
+        """Return True after "can I have the chairs", "I want the chairs", and "get the chairs" with "into"."""
+        buffer, at = self._buffer, self._buffer.index - 1
+        while at > 0 and buffer.tagged[at][1] in _OBJECT_PHRASE_TAGS:
+            at -= 1
+        verb, before = buffer.tagged[at][0], [("", None), ("", None), *buffer.tagged[:at]][-2:]
+        if verb == "get" or at == buffer.index - 1:
+            return at < buffer.index - 1 and PREPOSITIONS.get(buffer.word(1)) == "to"
+        asked = before[0][1] is Tag.AUXILIARY and before[0][0] not in _DO_FORMS
+        states = before[1][1] in SUBJECT_TAGS and not asked  # "I have boxes stacked"
+        return verb in WISHES or (verb == "have" and not states)
 
     def _require(self, base: str) -> None:
         """Emit the verb of "the box must be moved"; of "no box may be moved", negate it before its subject."""
@@ -205,18 +232,12 @@ class VerbChunker:
 _DEMONSTRATIVES: Final = word_set("this that these those")
 # "go around the table to the sofa": the table is a waypoint, the sofa the goal
 _ROUTE_RELATIONS: Final = word_set("near past above")
-_DO_FORMS: Final = word_set("do does did")
 # "the drawer open", "is empty"
 _BEFORE_STATE_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.AUXILIARY})
 # tags before a preposition that states where something is, not where to put it
 _LOCATION_TAGS: Final = frozenset({Tag.AUXILIARY, Tag.RELATIVE, Tag.PARTICIPLE, Tag.GERUND, Tag.NEGATION})
 _OBSERVERS: Final = word_set("me you us")
 _THEY: Final = word_set("they he she")
-
-
-def chunk_sentence(text: str) -> list[Chunk]:
-    """Return the chunks of one normalised sentence, in order."""
-    return chunk_tagged(tag_words(lexical_units(text)))
 
 
 def chunk_tagged(tagged: Sequence[tuple[str, Tag]]) -> list[Chunk]:
@@ -328,7 +349,8 @@ class _Chunker:
             buffer.words = []
         buffer.close()
         buffer.has_determiner, buffer.determiner_at = True, buffer.index
-        if word in ORDINALS and buffer.tag(1) in NOUN_PHRASE_TAGS:
+        is_extreme = word == "most" and buffer.word(-1) == "the"
+        if is_extreme or (is_ordinal(word) and buffer.tag(1) in NOUN_PHRASE_TAGS):
             buffer.words.append(word)
 
     def _indefinite(self, word: str) -> None:

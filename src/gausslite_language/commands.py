@@ -6,7 +6,4 @@ from typing import Final
 
 from gausslite.plugins import Command
 
-PARSE: Final = Command(
-    "parse a task sentence into targets, anchors and relations",
-    "gausslite_language.parse_command",
-)
+PARSE: Final = Command("parse a task sentence into targets, anchors and relations", "gausslite_language.parse_command")

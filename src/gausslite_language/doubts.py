@@ -9,15 +9,18 @@ from gausslite_language import lexicon
 from gausslite_language.chunk import noun_phrase
 from gausslite_language.clause_types import ClauseType, clause_types
 from gausslite_language.graph_draft import GraphDraft
-from gausslite_language.lexicon import singular
+from gausslite_language.lexicon import singular, word_set
 from gausslite_language.spelling import is_in_dictionary
 from gausslite_language.tags import Tag, is_english
 
-_NO_NAMES: Final = (
-    *(lexicon.ADDRESSEES, lexicon.TASK_NOUNS, lexicon.PLACES, lexicon.MEASURES, lexicon.ROUTES, lexicon.BODY_PARTS),
-    *(lexicon.MANNER_NOUNS, lexicon.TIME_NOUNS, lexicon.DEFECTS),
+_NO_OBJECTS: Final = lexicon.PLACES | lexicon.TIME_NOUNS | {"one", "ones"}
+# "a leak" may be no object, "the leak" is one
+_NO_OBJECTS_BARE: Final = frozenset().union(
+    *(lexicon.ADDRESSEES, lexicon.TASK_NOUNS, lexicon.MEASURES, lexicon.ROUTES, lexicon.BODY_PARTS),
+    *(lexicon.MANNER_NOUNS, lexicon.DEFECTS),
 )
-_NO_OBJECTS: Final = frozenset({"one", "ones"}).union(*_NO_NAMES)
+_DEFINITE: Final = word_set("the this these those")
+_CLOSERS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE, Tag.GERUND, Tag.PARTICIPLE})
 _PREDICATES: Final = frozenset({Tag.VERB, Tag.AUXILIARY, Tag.PARTICIPLE})
 _BEFORE_STATES: Final = frozenset({Tag.AUXILIARY, Tag.PRONOUN})
 
@@ -25,20 +28,25 @@ _BEFORE_STATES: Final = frozenset({Tag.AUXILIARY, Tag.PRONOUN})
 def lost_nouns(tagged: Sequence[tuple[str, Tag]], draft: GraphDraft) -> tuple[str, ...]:
     """Return the nouns of a sentence that are in no part of its graph and in no warning.
 
-    Reasons, who acts in a statement, rooms, states ("I am hungry") and one side of an "of" do not count.
+    A word that closes a phrase after "the" counts as a noun, whatever its tag: "carry the injured". Reasons, who acts
+    in a statement, rooms, states ("I am hungry") and one side of an "of" do not count.
     """
     names = (*draft.targets, *draft.anchors, *draft.excluded, *draft.context, *draft.warnings)
     used = {singular(word.strip("'")) for name in names for word in name.split()} | _NO_OBJECTS
     types, clause = clause_types(tagged), ClauseType.REQUEST
     lost: dict[str, None] = {}
     padded = [("", None), ("", None), *tagged, ("", None), ("", None)]
+    is_definite = False
     for index, (word, tag) in enumerate(tagged):
         clause = types.get(index, clause)
         before, next_tag = padded[index + 1][1], padded[index + 3][1]
+        is_definite = word in _DEFINITE or (is_definite and tag in _CLOSERS and before is not Tag.NOUN)
         acts = clause is ClauseType.REASON or (clause is ClauseType.STATEMENT and next_tag in _PREDICATES)
-        if tag is not Tag.NOUN or next_tag is Tag.NOUN or acts or before in _BEFORE_STATES:
+        closes = next_tag is not Tag.NOUN if tag is Tag.NOUN else is_definite and next_tag not in _CLOSERS
+        if tag not in _CLOSERS or not closes or acts or before in _BEFORE_STATES:
             continue
-        if not ({word, singular(word)} & used or lexicon.is_space((word,)) or _is_amount(tagged, index, used)):
+        known = used if is_definite else used | _NO_OBJECTS_BARE
+        if not ({word, singular(word)} & known or lexicon.is_space((word,)) or _is_amount(tagged, index, known)):
             lost[singular(word)] = None
     return tuple(lost)
 

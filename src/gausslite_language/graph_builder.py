@@ -40,12 +40,10 @@ class GraphBuilder:
         self._pending: str | None = None
         self._alternative: str | None = None  # "under" in "under or behind the couch"
         self._negated = False
-        self._avoids = False  # the negation itself means contact: "avoid touching"
         self._corrects = False
         self._negated_objects: list[str] = []
-        self._partitive: tuple[NounPhrase, str | None, bool] | None = (
-            None  # "the largest" of "the largest of the boxes"
-        )
+        # "the largest" of "the largest of the boxes"
+        self._partitive: tuple[NounPhrase, str | None, bool] | None = None
         self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
         self._plurals: set[str] = set()
@@ -137,10 +135,9 @@ class GraphBuilder:
             self._assigner.reach_places()  # "wait by the door but don't open it"
         self._corrects = word == "not" and not self._draft.targets
         self._negate()
-        self._avoids = word.startswith("avoid ")
 
     def _negate(self) -> None:
-        self._pending, self._negated, self._avoids, self._negated_objects = None, True, False, []
+        self._pending, self._negated, self._negated_objects = None, True, []
         self._clause.nouns_since_negation = 0
         self._clause.verb_since_negation = False
 
@@ -245,9 +242,8 @@ class GraphBuilder:
             self._clause.nouns_since_negation += 1
             return
         names_more = self._pending is None and after is not None and after.kind is ChunkKind.PREPOSITION
-        left = self._clause.verb in verbs.LEAVING_VERBS and bool(
-            self._draft.context
-        )  # "you are in a kitchen. leave it"
+        # "you are in a kitchen. leave it"
+        left = self._clause.verb in verbs.LEAVING_VERBS and bool(self._draft.context)
         if left or (self._clause.verb is None and self._pending is None) or (names_more and self._clause.objects):
             return  # "the tiles, especially those behind the toilet"
         self._draft.unnamed = self._draft.unnamed or word
@@ -363,6 +359,7 @@ class GraphBuilder:
         elif noun.head in lexicon.PLACES and pending is None:
             self._draft.whole_place = noun.text
         self._clause.inherited_preposition = pending if of_follows else None
+        self._clause.inherits_goal = pending == "to" and not of_follows  # "to the spot behind the truck"
         self._clause.skip_of_phrase, self._clause.inherited_conjoined = of_follows, conjoined
 
     def _negate_latest(self) -> None:
@@ -377,7 +374,7 @@ class GraphBuilder:
         clause.nouns_since_negation += 1
         if not direct:
             self._place_negated(noun, pending or "near")
-        elif self._avoids or (clause.verb_since_negation and self._may_harm(pending)):
+        elif clause.verb_since_negation and self._may_harm(pending):
             self._draft.add_target(noun.text, TargetRole.OBSTACLE)
             self._negated_objects.append(noun.text)
         else:

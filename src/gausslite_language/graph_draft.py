@@ -171,7 +171,7 @@ class Clause:
     precedes the latest noun. describes: an indefinite noun after "with" does. crosses: the way crosses a place.
     by_pronoun: the objects come from "it".
     adds_place: the preposition follows a conjunction. route: the clause mentions a path. skip_of_phrase: the next "of"
-    continues a noun that names no object.
+    continues a noun that names no object. inherits_goal: the place that follows says where the goal is.
     """
 
     def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
@@ -183,25 +183,13 @@ class Clause:
         self.terms = RelationTerms("near")
         self.places: list[str] = []
         self.superlative: str | None = None
-        self.statement = False
-        self.conjoined = False
-        self.describes = False
-        self.crosses = False
-        self.is_alternative = False
-        self.is_part = False
-        self.between = False
-        self.in_space = False
+        self.statement = self.follows_statement = self.by_pronoun = self.conjoined = self.is_alternative = False
+        self.describes = self.crosses = self.route = self.is_part = self.between = self.in_space = False
+        self.adds_place = self.current_place = self.skip_of_phrase = self.inherited_conjoined = False
+        self.inherits_goal = self.verb_since_negation = False
         self.preposition = ""
-        self.adds_place = False
-        self.current_place = False
-        self.by_pronoun = False
-        self.follows_statement = False
-        self.route = False
-        self.skip_of_phrase = False
-        self.inherited_conjoined = False
         self.inherited_preposition: str | None = None
         self.nouns_since_negation = 0
-        self.verb_since_negation = False
 
 
 class RelationAssigner:

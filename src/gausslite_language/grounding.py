@@ -21,12 +21,13 @@ from gausslite.domain.task import (
 from gausslite.nouns import same_kind
 from gausslite_language import lexicon
 from gausslite_language.chunk import noun_phrase
-from gausslite_language.chunker import chunk_sentence
+from gausslite_language.chunker import chunk_tagged
 from gausslite_language.graph_builder import build_draft
 from gausslite_language.graph_draft import GraphDraft
 from gausslite_language.lexicon import DescribedNoun, singular, split_attributes, word_set
 from gausslite_language.nouns import are_one_kind
-from gausslite_language.tokens import tokenize
+from gausslite_language.tags import tag_words
+from gausslite_language.tokens import lexical_units, tokenize
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,7 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
     require_task_text(text)
     mentioned, all_warnings = _sentence_words(text), list(parsed.warnings)
     if draft is None:
-        draft = build_draft(chunk_sentence(normalise_text(text)))
+        draft = build_draft(chunk_tagged(tag_words(lexical_units(normalise_text(text)))))
         parsed = _with_rule_negations(parsed, draft, all_warnings.append)
     warn = all_warnings.append
     targets = _without_excluded(draft, _mentioned_phrases("target", tuple(parsed.targets), mentioned, warn), warn)

@@ -23,7 +23,7 @@ COMPARATIVES: Final = frozenset(
     if word.endswith("er") and superlative not in (Superlative.NEAREST, Superlative.FARTHEST)
 ) | word_set("heavier lighter older newer thicker thinner")
 DISTANCE_SUPERLATIVES: Final = frozenset({Superlative.NEAREST, Superlative.FARTHEST})
-ORDINALS: Final = word_set("first second third fourth fifth sixth seventh eighth ninth tenth last")
+_ORDINALS: Final = word_set("first second third fourth fifth sixth seventh eighth ninth tenth eleventh twelfth last")
 _JOINED: Final = "-and-"
 
 
@@ -37,16 +37,21 @@ class DescribedNoun:
     unseen: tuple[str, ...] = ()
 
 
+def is_ordinal(word: str) -> bool:
+    """Return True for "second" and "2nd"."""
+    return word in _ORDINALS or (word[0].isdigit() and word.endswith(("st", "nd", "rd", "th")))
+
+
 def is_attribute(word: str) -> bool:
     """Return True for words that never stand in a name."""
-    return word in SUPERLATIVES or is_unseen(word) or word in ORDINALS or _is_colour(word)
+    return word in SUPERLATIVES or is_unseen(word) or is_ordinal(word) or _is_colour(word)
 
 
 def is_unseen(word: str) -> bool:
     """Return True for the superlative or comparative of a property that geometry does not show: "oldest", "heavier"."""
     ending = next((ending for ending in ("est", "er") if word.endswith(ending)), None)
     if ending is None or word in ADJECTIVES or (ending == "er" and is_thing(word)):
-        return word in ("best", "worst")
+        return word in ("best", "worst", "most", "least")
     stem = word.removesuffix(ending)
     return any(
         adjective in ADJECTIVES
@@ -65,7 +70,7 @@ def split_attributes(phrase: str) -> DescribedNoun:
         following = words[at + 1] if at + 1 < len(words) else head
         if word in SUPERLATIVES:
             superlative = SUPERLATIVES[word]
-        elif is_unseen(word) or (word in ORDINALS and (word, following) != ("first", "aid")):
+        elif is_unseen(word) or (is_ordinal(word) and (word, following) != ("first", "aid")):
             unseen.append(word)
         elif (_is_colour(word) and (word, following) not in _COLOUR_COMPOUNDS) or (
             word in _SHADES and _is_colour(following) and at + 1 < len(words)

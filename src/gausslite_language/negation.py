@@ -58,7 +58,12 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.emit_preposition("near", word)
     elif after is Tag.AUXILIARY and buffer.tag(2) in (Tag.PARTICIPLE, Tag.VERB):
         _exclude_subject(buffer, word)
-    elif before is Tag.AUXILIARY and buffer.word(-1) != "do" and (after not in _EXCLUDING_TAGS or _is_state(buffer)):
+    elif (
+        before is Tag.AUXILIARY
+        and word != "do not"
+        and buffer.word(-1) != "do"
+        and (after not in _EXCLUDING_TAGS or _is_state(buffer))
+    ):
         buffer.emit(ChunkKind.NOT_UNDERSTOOD, f"{word} {buffer.word(1)}".strip())
     else:
         buffer.emit(ChunkKind.NEGATION, word)

@@ -22,6 +22,7 @@ _DESTINATION_RELATIONS: Final = word_set(
 # both objects of these verbs are targets
 _PAIRING_VERBS: Final = word_set("compare swap exchange")
 _PUSHED_TO: Final = word_set("near under behind in_front_of between left_of right_of")
+_SHIFTING_VERBS: Final = (verbs.CARRY_VERBS | verbs.MOVING_VERBS) - verbs.FETCHING_VERBS | {"carry"}
 _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
 _CROSSING_VERBS: Final = verbs.LEAVING_VERBS | (verbs.GO_VERBS - verbs.REACHING_VERBS - verbs.COVERING_VERBS)
 _PASSING_VERBS: Final = verbs.GO_VERBS - verbs.STOPPING_VERBS - word_set("park dock land")
@@ -34,7 +35,6 @@ class RoleAssigner:
     def __init__(self, draft: GraphDraft) -> None:
         self._draft = draft
         self._relations = RelationAssigner(draft)
-
         self.rename = self._relations.rename
 
     @property
@@ -264,10 +264,15 @@ class RoleAssigner:
     def _is_destination(self, pending: str, following: Sequence[Chunk]) -> bool:
         """Return True if the preposition states where to put the objects: "put the mug on the desk"."""
         clause = self.clause
+        if clause.inherits_goal and clause.objects:
+            clause.inherits_goal = False
+            return True
         moved = clause.verb not in verbs.LOOKING_VERBS | verbs.TOOL_VERBS | verbs.FETCHING_VERBS
         if clause.by_pronoun and moved and not clause.statement and pending in _DESTINATION_RELATIONS:
             return True  # "and line them up on the shelf"
-        pushes = clause.verb in verbs.PUSHING_VERBS and bool(clause.objects)
+        shifting = verbs.CARRY_VERBS if clause.preposition.endswith("side of") else _SHIFTING_VERBS
+        shifts = clause.preposition.startswith("to the ") and clause.verb in shifting  # "to the left of"
+        pushes = (shifts or clause.verb in verbs.PUSHING_VERBS) and bool(clause.objects)
         are_objects = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
         # "push the ball between the cones", unlike "push the button next to the door"
         moves = pushes and are_objects and not clause.is_part and clause.verb != "pull" and pending in _PUSHED_TO
@@ -438,7 +443,7 @@ class RoleAssigner:
             if pending == "from_inside" and not encloses and noun.head not in lexicon.ROOMS:
                 self._assign_waypoint(noun, conjoined=True)  # "out of the back door"
             return
-        if clause.verb is None and any(word in lexicon.ORDINALS for word in " ".join(clause.objects).split()):
+        if clause.verb is None and any(lexicon.is_ordinal(word) for word in " ".join(clause.objects).split()):
             return  # "the second chair from the window"
         relation = _ORIGIN_RELATIONS.get(pending, "inside" if encloses else "on")
         if clause.last_relation == "with":

@@ -17,7 +17,9 @@ from gausslite_language.grounding import ParsedPhrases, grounded_graph, normalis
 from gausslite_language.spelling import read_typed
 from gausslite_language.tags import is_english, tag_words
 from gausslite_language.tokens import comparisons, lexical_units, tokenize
+from gausslite_language.verbs import ASPECT_VERBS, AVOIDING_VERBS
 
+_AVOIDS: Final = AVOIDING_VERBS - ASPECT_VERBS
 _CODE: Final = re.compile(r"[{}\[\]<=|\\$*]|(?<![-=])>|\w\(|&&|^import ")
 
 
@@ -64,7 +66,7 @@ def lost_warning(noun: str) -> str:
 
 def _loses_negation(chunks: list[Chunk], draft: GraphDraft) -> bool:
     """Return True if the sentence negates something and neither the graph nor a warning says so."""
-    negates = any(chunk.kind is ChunkKind.NEGATION or chunk.negated for chunk in chunks)
+    negates = any(chunk.kind is ChunkKind.NEGATION or chunk.negated or chunk.word in _AVOIDS for chunk in chunks)
     is_stated = draft.warnings or draft.excluded or TargetRole.OBSTACLE in draft.roles.values()
     return negates and not is_stated and not any(relation.negated for relation in draft.relations)
 

@@ -15,6 +15,7 @@ from gausslite_language.verbs import TABLES, word_set
 
 _SHORT_FORMS: Final[dict[str, str]] = TABLES["abbreviations"]
 _SHORT_FORM: Final = re.compile(rf"(?<![\w/'-])(?:{'|'.join(map(re.escape, _SHORT_FORMS))})(?![\w/'-])")
+_CONTRACTIONS: Final = frozenset(word for word in _SHORT_FORMS if len(word) > 4 and word.isalpha())
 _NAME: Final = re.compile(r"(?<=[\w,] )[A-Z]\w+")
 _WORD: Final = re.compile(r"(?<![\w'])[^\W\d_]{3,}(?![\w'])")
 _LISTED: Final = frozenset().union(*(word_set(line) for line in TABLES.values() if isinstance(line, str)))
@@ -49,13 +50,19 @@ def nearest_word(word: str) -> str | None:
     frequencies = _frequencies()
     if word in frequencies:
         return None
-    near = _with_one_error(word) & (frequencies.keys() | vocabulary().senses.keys())
-    usable = [known for known in near if is_english(known)]
-    return min(
+    near = _with_one_error(word) & (frequencies.keys() | vocabulary().senses.keys() | _CONTRACTIONS)
+    usable = [known for known in near if is_english(known) or known in _CONTRACTIONS]
+    found = min(
         usable,
-        key=lambda known: (_error(word, known), known not in _LISTED, -frequencies.get(known, 0), known),
-        default=None,
+        key=lambda known: (
+            _error(word, known),
+            known not in _LISTED | _CONTRACTIONS,
+            -frequencies.get(known, 0),
+            known,
+        ),
+        default="",
     )
+    return _SHORT_FORMS.get(found, found) or None
 
 
 def is_in_dictionary(word: str) -> bool:

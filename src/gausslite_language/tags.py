@@ -107,6 +107,9 @@ Options = dict[Tag, int]
 
 # "go stand", "help clean": the second verb is the instruction
 _LEADING_VERBS: Final = word_set("go come help")
+_AVOIDS: Final = word_set("avoid avoiding evade evading")
+_STOPS: Final = word_set("stop stopping quit quitting cease ceasing")
+_ENTERED: Final = word_set("on above past inside to from")
 _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
 _MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
 _USUALLY_VERBS: Final = verbs.GO_VERBS | verbs.TOOL_VERBS | verbs.SEARCH_VERBS | word_set("stop hand")
@@ -153,7 +156,26 @@ def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
     kept = [unit for unit in units if not is_adverb(unit)]
     later = (kept[at + 2 : at + 4] if kept[at + 1 : at + 2] != ["the"] else [] for at in range(len(kept)))
     neighbours = zip(["", *kept], kept, [*kept[1:], ""], later, strict=False)
-    return list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True))
+    return _deny_gerunds(list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True)))
+
+
+def _deny_gerunds(tagged: list[tuple[str, Tag]]) -> list[tuple[str, Tag]]:
+    """Return the words with "avoid" and "stop" before a gerund as negations, unlike "stop driving at the gate"."""
+    read: list[tuple[str, Tag]] = []
+    ends = [("", Tag.CLAUSE_BREAK)] * 2
+    for (word, tag), (gerund, next_tag), (place, _) in zip(
+        tagged, [*tagged, *ends][1:], [*tagged, *ends][2:], strict=False
+    ):
+        relation = PREPOSITIONS.get(split_bounds(place)[0], "on")
+        stops_there = verbs.base_of_ing(gerund) in verbs.GO_VERBS and relation not in _ENTERED
+        denies = word in _AVOIDS or (word in _STOPS and not stops_there)
+        if not denies or tag not in (Tag.VERB, Tag.GERUND) or next_tag is not Tag.GERUND:
+            read.append((word, tag))
+        elif read and read[-1][1] is Tag.NEGATION:
+            read.pop()  # "do not stop wiping"
+        else:
+            read.append(("do not", Tag.NEGATION))
+    return read
 
 
 def is_adverb(word: str) -> bool:
@@ -169,6 +191,7 @@ def is_adverb(word: str) -> bool:
 def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str]) -> Tag | None:
     """Return the tag that a word can only have between these neighbours; None if others are possible."""
     opens, is_place, is_open = before in _OPENERS, after in PREPOSITIONS, word not in _CLOSED
+    denying = _STOPS if is_open else _AVOIDS  # "stop moving boxes", "avoid touching"
     ends = not after or is_place or after == "and"
     stops = word in ("stop", "wait") and ends and _is_noun(before) and before not in lexicon.CONTAINERS
     commands = (
@@ -206,7 +229,7 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (word.endswith("ing") and named)
         or (word == "half" and after == "of"),  # "stand lamp"
         Tag.PREPOSITION: word == "outside" and after in lexicon.DETERMINERS,
-        Tag.GERUND: before in ("without", *_BE) and verbs.base_of_ing(word) is not None,
+        Tag.GERUND: verbs.base_of_ing(word) is not None and (before in ("without", *_BE) or before in denying),
         Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
         Tag.DETERMINER: word == "one" and after == "of",
     }

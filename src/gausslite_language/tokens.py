@@ -26,6 +26,7 @@ _MIN: Final = (
     r"at least|more than|over|above|beyond|a minimum of|min(?:imum)?|(?:further|farther)(?: away)? than|"
     r"outside(?: of)?|(?:no|not) (?:less|closer|nearer)(?: away)? than"
 )
+_LIMIT: Final = r"(?:at (?:least|most)|up to|(?:no|not) (?:more|less|fewer) than)"
 _ABOUT: Final = r"about|around|roughly|approximately|approx|some|exactly|nearly|almost|just|only|circa"
 # other prepositions that a distance can bound
 _BOUNDED: Final = (
@@ -138,6 +139,7 @@ _PLAIN: Final = {
     r"gets(?= \w+(?:ed|en|wn)\b)|(?:is|are) to be": "should be",
     r"(is|are|was|were|does|did|has|have|would|could|should|must|need)n't": r"\1 not",
     r"let's": "let us",
+    r"(left|right|top|bottom|upper|lower)[ -]most": r"\1most",
     r"^whose": "the",
     r",? ?(?:which|that) belongs? to (?:the |my )?[\w']+,?": "",
     r"belonging to": "of",
@@ -227,7 +229,7 @@ _PLAIN: Final = {
     r"((?:make|take) an? (?:\w+ )?(?:photo|picture|video|image|scan)) from": r"\1 of",
     r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
     r"(?:as|so) long as|provided(?: that)?": "if",
-    rf"(?:at (?:least|most)|up to|(?:no|not) (?:more|less|fewer) than)(?= {_VALUE} (?!{_UNIT}\b))": "",
+    rf"{_LIMIT} (?:once|twice)|(?:{_LIMIT} )?{_VALUE} times|{_LIMIT}(?= {_VALUE} (?!{_UNIT}\b))": "",
     r"[.,;] (?:location|position|place)(?: is)?:": "",
     r"after (?:that|this)(?= \w)": "then",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
@@ -247,15 +249,17 @@ _PLAIN: Final = {
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
-    r"(?:be|being) careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|"
-    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|by no means|"
-    r"it is forbidden to|(?:you )?(?:need not|(?:do not|don't) (?:have|need) to|are not (?:allowed|permitted) to)|"
-    r"(?:under|in) no (?:circumstance|case)s?(?: should you)?": "do not",
+    r"(?:you )?(?:need not|(?:do not|don't) (?:have|need) to|are not (?:allowed|permitted) to)|it is forbidden to|"
+    r"(?:(?:refrain|abstain|desist|keep|hold back) from|hold off on|no more)(?= \w+ing\b)|tak(?:e|ing) care not to|"
+    r"(?:under|in) no (?:circumstance|case)s?(?: should you)?|(?:be|being) careful (?:not to|to not)|by no means|"
+    r"make sure (?:not to|you don't|to not)|there is no need (?:for you )?to|try not to|avoid to": "do not",
     r"^(\w+) nothing": r"do not \1 anything",
     r"(?:keep (?:your|the) )?(?:hands|fingers) (?:off|away from)": "do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
-    r"(?<=, )avoiding|(?:stay|keep) out of": "avoid",
+    r"(?:stay|keep) out of": "avoid",
+    r"(?<!while),? avoiding": ", avoid",
+    r"(?:try|take care|be careful|be sure|make sure) (?:to|you)(?= avoid)": "",
     r"give (.{2,60}?) a (?:wide )?berth": r"avoid \1",
     r"(?:stay|keep|remain) close to": "follow",
     r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",

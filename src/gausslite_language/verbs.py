@@ -67,7 +67,6 @@ COVERING_VERBS: Final = SEARCH_VERBS | INSPECTION_VERBS | TOOL_VERBS | words("co
 HANDLING_VERBS: Final = words("handling_verbs")
 VERBS: Final = FILLING_VERBS | INSPECTION_VERBS.union(*(words(name) for name in TABLES if name.endswith("_verbs")))
 
-
 # past forms and participles that do not end in -ed
 _IRREGULAR: Final = dict(pair.split(":") for pair in words("irregular_verb_forms"))
 _PARTICLES: Final = word_set("up down off out over away around about back through along past at into across onto for")

@@ -38,29 +38,19 @@ def test_the_path_has_the_least_cost(candidates):
 @pytest.mark.parametrize(
     ("text", "word", "tag"),
     [
-        ("Water the plant", "water", Tag.VERB),
-        ("Bring the plant some water", "water", Tag.NOUN),
-        ("Clean the light", "light", Tag.NOUN),
-        ("Light the candles", "light", Tag.VERB),
-        ("Take out the light box", "light", Tag.ADJECTIVE),
-        ("Find the dustpan and dust the shelf", "dust", Tag.VERB),
-        ("Wipe off the dust", "dust", Tag.NOUN),
-        ("Take the laundry out and fold it", "fold", Tag.VERB),
-        ("Go to the bus stop", "stop", Tag.NOUN),
-        ("The mugs on the rack belong in the cupboard", "belong", Tag.VERB),
-        ("Which shelf holds the cans", "holds", Tag.VERB),
-        ("Empty the trash can by the door", "can", Tag.NOUN),
-        ("Can you open the door", "can", Tag.AUXILIARY),
-        ("Go to the charging station", "charging", Tag.NOUN),
+        ("Water the plant", "water", Tag.VERB), ("Bring the plant some water", "water", Tag.NOUN),
+        ("Clean the light", "light", Tag.NOUN), ("Light the candles", "light", Tag.VERB),
+        ("Take out the light box", "light", Tag.ADJECTIVE), ("Find the dustpan and dust the shelf", "dust", Tag.VERB),
+        ("Wipe off the dust", "dust", Tag.NOUN), ("Take the laundry out and fold it", "fold", Tag.VERB),
+        ("Go to the bus stop", "stop", Tag.NOUN), ("The mugs on the rack belong in the cupboard", "belong", Tag.VERB),
+        ("Which shelf holds the cans", "holds", Tag.VERB), ("Empty the trash can by the door", "can", Tag.NOUN),
+        ("Can you open the door", "can", Tag.AUXILIARY), ("Go to the charging station", "charging", Tag.NOUN),
         ("Find the person holding a cup", "holding", Tag.GERUND),
-        ("Someone left a pram in the hall", "left", Tag.PARTICIPLE),
-        ("Open the left drawer", "left", Tag.ADJECTIVE),
-        ("Find the mug that is on the desk", "that", Tag.RELATIVE),
-        ("Bring that mug", "that", Tag.DETERMINER),
-        ("Glorb the wug", "glorb", Tag.VERB),
-        ("Bring the glorb", "glorb", Tag.NOUN),
+        ("Someone left a pram in the hall", "left", Tag.PARTICIPLE), ("Open the left drawer", "left", Tag.ADJECTIVE),
+        ("Find the mug that is on the desk", "that", Tag.RELATIVE), ("Bring that mug", "that", Tag.DETERMINER),
+        ("Glorb the wug", "glorb", Tag.VERB), ("Bring the glorb", "glorb", Tag.NOUN),
     ],
-)
+)  # fmt: skip
 def test_a_tag_depends_on_neighbouring_words(text, word, tag):
     assert tags_of(text)[word] is tag
 
