@@ -14,14 +14,15 @@ from gausslite.datasets.open import open_source
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.localisation_monitor import UNPLACED, LocalisationState
 from gausslite.mission.runner import MissionTotals
-from gausslite.mission.schedule import Timeline, read_timeline
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.cpu import CpuRasterizer
 from gausslite_relocalisation.monitor import FrameMonitor
+from gausslite_view.timeline import Timeline, read_timeline
 
 TRACKED, DOUBTFUL, LOST = LocalisationState
 STEP_NS = 200_000_000
@@ -128,18 +129,18 @@ def test_a_place_that_was_never_seen_changes_no_bit_of_the_map_and_the_mission_s
     lost = _moved(_frames(camera, UNSEEN * 5, first=len(HERE)), HERE[-1] @ inverse(UNSEEN[0]))
     for outcome in _process(mission, frames):
         totals.add(outcome)
-        timeline.add(outcome)
+        timeline.add(outcome, PoseTable(), mission.gaussians)
     before = mission.gaussians()
     for outcome in _process(mission, lost):
         totals.add(outcome)
-        timeline.add(outcome)
+        timeline.add(outcome, PoseTable(), mission.gaussians)
     assert np.array_equal(mission.gaussians().means_m, before.means_m)
     assert mission.localisation is LOST
     assert mission.notes == (
         "the robot's place is lost since frame 8: its images contradict the map; its frames are not mapped",
     )
     assert (totals.frames, totals.reasons[UNPLACED]) == (len(frames), len(lost))
-    timeline.write(tmp_path)
+    timeline.write(tmp_path, ())
     assert read_timeline(tmp_path)["localisation"].tolist() == [0] * len(frames) + [1, 1] + [2] * (len(lost) - 2)
     # carried back: the frames of the way wait no longer than the limit, and those that contradict are not mapped
     back = _moved(_frames(camera, HERE[:6], first=60), T_OTHER)

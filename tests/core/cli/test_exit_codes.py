@@ -16,7 +16,7 @@ from run_folders import write_run
 from tiny_sequences import write_tum
 
 from gausslite.cli.main import main
-from gausslite.process import TASK_NOT_FOUND, end_quietly_while_starting
+from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, end_quietly_while_starting
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "commands.md"
 ROWS = re.findall(r"^\| (\d+) \| .+ \| (?:`gausslite (.+)` )?\|$", PAGE.read_text(), re.MULTILINE)
@@ -81,7 +81,7 @@ def test_an_unknown_option_is_one_line_that_names_the_help_of_its_command(
 def test_the_page_lists_the_codes_of_signals() -> None:
     codes = {int(code) for code, _ in ROWS}
     of_signals = {128 + number for number in (signal.SIGINT, signal.SIGPIPE, signal.SIGTERM)}
-    assert {0, 1, 2, TASK_NOT_FOUND} | of_signals == codes
+    assert {0, 1, 2, TASK_NOT_FOUND, ROBOT_LOST} | of_signals == codes
 
 
 class SignalAtOpen:
