@@ -42,6 +42,8 @@ _LEAST_FACTOR = 1.5
 _JUMP = 0.03
 """A share of the image's width. Points of consecutive frames of real recordings are off by 0.005, of every fourth frame
 with unregistered depth by 0.023; a jump by 15 cm at a distance of 2 m by 0.032."""
+_MIN_INLIERS_ALONE = 24
+"""Matches from which one pair is evidence: 14 of 300 features agree by chance on a motion that is wrong by 0.2 m."""
 _JUMP_RATIO, _LEAST_JUMP_M, _LEAST_JUMP_RAD, _MAX_JUMPS = 2.0, 0.05, 0.1, 6
 """A step of the poses is compared with the images if it is by this ratio longer than the median and not small."""
 _MIN_CLOCK_S, _MAX_CLOCK_S = 0.1, 3.0
@@ -70,9 +72,10 @@ class _Pair:
         return self._errors_px(motions)[1]
 
     def contradicts(self, motion: Float64[ndarray, "4 4"]) -> bool:
-        """True if the image shows a clearly different motion of the points."""
+        """True if the image shows a clearly different motion of enough points."""
         error_px, share = self._errors_px(motion[None])
-        return bool(error_px[0] > _JUMP * self.camera.width_px and share[0] > _RIGHT)
+        has_enough = self.matched.inliers >= _MIN_INLIERS_ALONE
+        return has_enough and bool(error_px[0] > _JUMP * self.camera.width_px and share[0] > _RIGHT)
 
     def _errors_px(self, motions: Float64[ndarray, "h 4 4"]) -> tuple[Float64[ndarray, " h"], Float64[ndarray, " h"]]:
         """Return the median errors in pixels and as shares, see `errors`."""
