@@ -38,9 +38,9 @@ from gausslite_cluster.regions import Owners
 from gausslite_cluster.shared_watch import SharedRevisions, SharedWatch
 from gausslite_fusion_server.contributions import Acknowledger
 from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message
+from gausslite_fusion_server.plugins import MessageCounts
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
 from gausslite_fusion_server.settings import ServerSettings
-from gausslite_fusion_server.stores import MessageCounts
 from gausslite_fusion_server.watch import watched_part
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class

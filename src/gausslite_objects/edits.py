@@ -26,6 +26,7 @@ from gausslite.mission.results import read_report
 _FILE, CARRIED = "object_edits.json", "object_edits"
 """File of a run, and key of the report of a run that continues an edited map."""
 _NONE: dict[str, list[Any]] = {"edits": []}
+_OBJECTS = ("target", "other")
 _MAX_EDITS = 1000
 _MARGIN_M = 0.1
 """An object is the edited one if its centre is in the edited one's box or within this of it."""
@@ -84,9 +85,6 @@ class Edit:
             return cls(EditKind(value["kind"]), author, time_ns, target, text, other)
         except (KeyError, TypeError, ValueError, InvalidInputError) as error:
             raise CodecError(f"edit: expected the JSON of an edit, got other values ({error})") from error
-
-
-_OBJECTS = ("target", "other")
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.fusion.traffic import ACKNOWLEDGEMENT_BOUNDS_S, Acknowledgements, AgentContribution, MissionStatus
 from gausslite.process import import_extra
 from gausslite.wire.channel import host_and_port
-from gausslite_fusion_server.stores import FindCounts, FindEngine
+from gausslite_fusion_server.plugins import FindCounts, FindEngine
 
 _log = logging.getLogger(__name__)
 

@@ -59,7 +59,7 @@ class FrameMonitor(LocalisationMonitor):
         self._search: PlaceSearch | None = None
         self._earlier: list[Frame] = []
         self._newest: Frame | None = None
-        self._cause, self._goes_on = "", False
+        self._cause, self._is_continued = "", False
         # of the present doubt: its first frame; frames so far; the latest ones in a row that agree, or leave it open
         self._since = self._doubtful = self._agreed = self._open = 0
         # of the mission: frames that agreed, doubts, places that were found
@@ -133,10 +133,10 @@ class FrameMonitor(LocalisationMonitor):
         agreement = self._compare(frame, mapper)
         self._agreed = self._agreed + 1 if agreement is Agreement.AGREES else 0
         self._open = self._open + 1 if agreement is Agreement.UNKNOWN else 0
-        self._goes_on &= agreement is not Agreement.CONTRADICTS
-        # of an odometry that goes on, a place that was not mapped is no sign of another place
-        goes_on = self._goes_on and self._open >= _LOST_AFTER
-        if goes_on or self._agreed >= _AGREEING[self._localisation]:
+        self._is_continued &= agreement is not Agreement.CONTRADICTS
+        # an odometry in its own frame places the robot also where nothing was mapped
+        is_at_new_place = self._is_continued and self._open >= _LOST_AFTER
+        if is_at_new_place or self._agreed >= _AGREEING[self._localisation]:
             return self._end_doubt(frame)
         if self._waiting and is_another_place(frame, self._waiting[-1]):
             self._begin_odometry()
@@ -164,7 +164,7 @@ class FrameMonitor(LocalisationMonitor):
     def _by_images(self, frame: Frame, mapper: GaussianMapper) -> Float64[ndarray, "4 4"] | None:
         """Return T_map_odometry of an odometry whose jump the images have measured, if the map shows the same."""
         T_before_now = self._steps.T_before_now
-        if T_before_now is None or self._goes_on or not mapper.count:
+        if T_before_now is None or self._is_continued or not mapper.count:
             return None
         T = mapper.poses.T_corrected_odometry
         T_map_now = T_before_now if T is None else T @ T_before_now
@@ -181,7 +181,7 @@ class FrameMonitor(LocalisationMonitor):
             self._localisation = LocalisationState.DOUBTFUL
             self._since, self._doubtful, self._doubts = frame.index, 0, self._doubts + 1
             self._cause = doubt.cause
-        self._goes_on = doubt.goes_on
+        self._is_continued = doubt.is_continued
 
     def _begin_odometry(self) -> None:
         """Forget the frames of another odometry: what places one does not place the other."""

@@ -29,10 +29,10 @@ _SAME_PLACE_M, _SAME_PLACE_DEG = 0.2, 8.0
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Why a step is none of a robot. goes_on: the odometry is still what it was: only late, or it has jumped back."""
+    """Why a step is not the robot's motion. is_continued: the odometry keeps its frame: it is late or jumped back."""
 
     cause: str
-    goes_on: bool = False
+    is_continued: bool = False
 
 
 class OdometrySteps:
@@ -71,7 +71,7 @@ class OdometrySteps:
             return jump
         is_late = self._count > _MIN_STEPS and step[2] > max(_GAP_S, _USUAL * self._longest[2])
         if is_late:
-            return Doubt(f"no frame came for {step[2]:.1f} s", goes_on=self._is_back(frame))
+            return Doubt(f"no frame came for {step[2]:.1f} s", is_continued=self._is_back(frame))
         self._longest = np.maximum(self._longest, step)
         return None
 

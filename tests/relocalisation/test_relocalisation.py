@@ -1,4 +1,4 @@
-"""A robot that is lifted, covered or restarted is noticed and found again; one whose odometry goes on is left alone."""
+"""A robot that is lifted, covered or restarted is noticed and found again; one that drives on stays tracked."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_a_place_that_was_never_seen_changes_no_bit_of_the_map_and_the_mission_s
     assert (totals.frames, totals.reasons[UNPLACED]) == (len(frames) + len(back), len(lost))
 
 
-def test_a_robot_that_is_lifted_and_set_back_goes_on_without_the_frames_from_the_air(camera: MapCamera) -> None:
+def test_a_robot_that_is_lifted_and_set_back_is_mapped_without_the_frames_from_the_air(camera: MapCamera) -> None:
     frames = _frames(camera, HERE)
     air = [replace(frame, T_world_camera=HERE[4]) for frame in _frames(camera, UNSEEN[:2], first=5)]
     after = _frames(camera, HERE[5:], first=7)

@@ -22,9 +22,9 @@ from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
+from gausslite_fusion_server.plugins import FindCounts, FindEngine, MetricsServer, database_of, open_store
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import PROGRAM, FrameUse, ServerSettings, parse_arguments
-from gausslite_fusion_server.stores import FindCounts, FindEngine, MetricsServer, database_of, open_store
 
 _log = logging.getLogger(__name__)
 _SWITCH_INTERVAL_S = 0.001  # Python's 5 ms would delay the event loop behind a thread that computes

@@ -29,7 +29,7 @@ from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server import messages
 from gausslite_fusion_server.contributions import Acknowledger, StoredCount
-from gausslite_fusion_server.stores import MapRenderer, OpenRefiner, OpenRenderer, Refiner
+from gausslite_fusion_server.plugins import MapRenderer, OpenRefiner, OpenRenderer, Refiner
 from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
 _Message = TypeVar("_Message")
