@@ -39,7 +39,7 @@ class DescribedNoun:
 
 def is_ordinal(word: str) -> bool:
     """Return True for "second" and "2nd"."""
-    return word in _ORDINALS or (word[0].isdigit() and word.endswith(("st", "nd", "rd", "th")))
+    return word in _ORDINALS or (word[:1].isdigit() and word.endswith(("st", "nd", "rd", "th")))
 
 
 def is_attribute(word: str) -> bool:
@@ -132,7 +132,7 @@ _SPACE_HEADS: Final = word_set("room area lot hall park site zone storey wing de
 
 def is_space(words: tuple[str, ...]) -> bool:
     """Return True if a noun phrase is a room or a place: "kitchen", "parking lot", "living room"."""
-    named = [word for word in words if not word[0].isdigit()] or list(words)
+    named = [word for word in words if not word[:1].isdigit()] or list(words)
     return named[-1] in _SPACES or (len(words) > 1 and named[-1] in _SPACE_HEADS)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gausslite.domain.errors import TaskError
@@ -42,6 +42,7 @@ WORDS = st.sampled_from(
     | st.lists(WORDS, max_size=25).map(" ".join)
     | st.builds(lambda words, times: " ".join(words) * times, st.lists(WORDS | st.text(), max_size=4), st.just(20_000))
 )
+@example("NOT")
 def test_any_text_gives_a_valid_graph_or_one_line(text):
     try:
         graph = RuleParser().parse(text)
