@@ -272,10 +272,6 @@ class CameraMotion:
 
 
 _MAX_COEFFICIENT = 1e3
-_NEWTON_STEPS = 20
-_NEWTON_DIFFERENCE = 1e-6
-_UNDISTORT_TOLERANCE = 1e-7
-"""Largest error of an undistorted slope, distorted again: far below a pixel."""
 
 
 class LensModel(StrEnum):
@@ -346,29 +342,4 @@ class Lens:
         return (
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
-
-    def undistort(
-        self, x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]
-    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
-        """Return the slopes of the rays that meet the image plane at (x, y): the inverse of `distort`.
-
-        Raises InvalidInputError for a point that no ray meets, beyond the range in which the model can be inverted.
-        """
-        u, v, h = x, y, _NEWTON_DIFFERENCE
-        with np.errstate(all="ignore"):
-            for _ in range(_NEWTON_STEPS):
-                error_x, error_y = (at - to for at, to in zip(self.distort(u, v), (x, y), strict=True))
-                if max(np.abs(error_x).max(initial=0.0), np.abs(error_y).max(initial=0.0)) <= _UNDISTORT_TOLERANCE:
-                    return u, v
-                right, left, below, above = (
-                    self.distort(u + du, v + dv) for du, dv in ((h, 0), (-h, 0), (0, h), (0, -h))
-                )
-                xu, yu, xv, yv = right[0] - left[0], right[1] - left[1], below[0] - above[0], below[1] - above[1]
-                scale = 2 * h / (xu * yv - xv * yu)
-                u, v = u - scale * (yv * error_x - xv * error_y), v - scale * (xu * error_y - yu * error_x)
-        worst = int(np.argmax(np.nan_to_num(np.hypot(error_x, error_y), nan=np.inf)))
-        raise InvalidInputError(
-            f"lens {self}: expected a model that can be inverted over the image, "
-            f"got none at the slope ({x[worst]:.2f}, {y[worst]:.2f})"
         )

@@ -121,7 +121,6 @@ def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:
 
 
 MAX_OBJECTS_PER_AGENT = 200
-NO_TARGET_INDEX = -1
 MAX_OBJECT_COORDINATE_M = 1e6
 _MAX_TIME_NS = 1 << 62
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
@@ -213,11 +212,6 @@ class ObjectReport:
             raise InvalidInputError(f"objects: expected at most {MAX_OBJECTS_PER_AGENT}, got {len(self.objects)}")
         if len({landmark.object_id for landmark in self.objects}) != len(self.objects):
             raise InvalidInputError("objects: expected different ids, got a repeated one")
-
-    def target_index(self, noun: str) -> int:
-        """Return the index of a noun among the task's targets, as in a Gaussian's `target`; -1 for other nouns."""
-        nouns = [noun_of(target) for target in self.graph.targets]
-        return nouns.index(noun) if noun in nouns else NO_TARGET_INDEX
 
 
 @dataclass(frozen=True, slots=True)

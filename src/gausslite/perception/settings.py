@@ -55,11 +55,6 @@ class EvidenceSettings:
         require_plausible("evidence", self)
 
     @classmethod
-    def accept_all(cls) -> EvidenceSettings:
-        """Return settings that confirm every detection."""
-        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0, max_rival_ratio=np.inf, min_score_share=0.0)
-
-    @classmethod
     def accept_similar(cls) -> EvidenceSettings:
         """Return settings that also confirm objects that are rather a different thing."""
         return cls(max_rival_ratio=np.inf, min_score_share=0.0)

@@ -157,11 +157,6 @@ class SurfaceVotes:
         distances_m = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
         return _DISC_DIAMETERS * float(np.median(distances_m))
 
-    def lowest_m(self, up: Float64[ndarray, "3"], percentile: float) -> float:
-        """Return the level of the surface's bottom, along up in the world; NaN without a surface."""
-        levels_m = self.surface_m.astype(np.float64) @ up
-        return float(np.percentile(levels_m, percentile)) if len(levels_m) else np.nan
-
     def resolved(self, min_voxel_m: float) -> SurfaceVotes:
         """Return the votes in voxels of a twelfth of the extent, and of at least min_voxel_m."""
         wanted_m = max(min_voxel_m, self.extent_m / _EXTENT_VOXELS)
