@@ -346,7 +346,7 @@ class AgentMission:
         }
         report["notes"] = [*self._source_notes, *report["notes"]]
         prior = self._worker.prior
-        keyframes = self._worker.run(lambda mapper: mapper.keyframes()).result()
+        keyframes = self._worker.run(lambda mapper: mapper.store.kept).result()
         changes = compare_with_prior(prior, gaussians, self._worker.status().objects, keyframes)
         for line in changes.lines:
             _log.info("since the earlier map: %s", line)

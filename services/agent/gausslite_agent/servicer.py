@@ -224,7 +224,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
 
         def render(mapper: GaussianMapper) -> tuple[Rendering | None, int]:
-            return mapper.render(camera, T_world_camera) if mapper.count > 0 else None, self._worker.revision()
+            return mapper.render(camera, T_world_camera) if mapper.table.count > 0 else None, self._worker.revision()
 
         def work() -> pb.RenderViewResponse:
             # only rendered on the mapper's thread
