@@ -234,6 +234,11 @@ class FusedMapLayers:
         with self._lock:
             return self._votes.batch(agent_id)
 
+    def moved_bytes(self, agent_id: str) -> int:
+        """Return the memory that an agent's voxels take here as they are in another frame."""
+        with self._lock:
+            return self._votes.memory_bytes(agent_id)
+
     def begin_map(self, agent_id: str, moved: Sequence[str], dropped: Sequence[str]) -> str:
         """Begin another map of an agent; as FusionStore.begin_map. Raises StorageError."""
         with self._lock:
