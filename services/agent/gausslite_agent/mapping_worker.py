@@ -46,6 +46,12 @@ from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.settings import LoadSettings
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
 
+_Result = TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
+_log = logging.getLogger(__name__)
+_IDLE_WAIT_S = 10.0
+LOCALISING = "the agent localises itself in the map of --prior"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueuedFrame:
@@ -58,13 +64,6 @@ class QueuedFrame:
     def __post_init__(self) -> None:
         # else its receiver could cancel it
         self.report.set_running_or_notify_cancel()
-
-
-_Result = TypeVar("_Result")
-_Arguments = ParamSpec("_Arguments")
-_log = logging.getLogger(__name__)
-_IDLE_WAIT_S = 10.0
-LOCALISING = "the agent localises itself in the map of --prior"
 
 
 def _on_worker(

@@ -58,6 +58,9 @@ from gausslite_agent.messages import (
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
 
+_OUTCOMES_AHEAD = 16
+_ENCODERS, _MAX_WATCHERS_WAITING = 2, 1024
+
 
 class MapChangeLog:
     """The map's voxels at its latest revision, and the revision at which each last changed. Not thread-safe."""
@@ -120,10 +123,6 @@ class AgentMapReader:
     def _parts(self) -> Iterator[tuple[EncodedPart, ...]]:
         for number, part in enumerate(split_batch(self.batch, BLOCK_BYTES)):
             yield self.cache.get((*self.key, self.revision, number), partial(self.encode, part))
-
-
-_OUTCOMES_AHEAD = 16
-_ENCODERS, _MAX_WATCHERS_WAITING = 2, 1024
 
 
 class NewestTask:

@@ -26,6 +26,9 @@ from gausslite.v1 import task_pb2
 from gausslite.wire.convert_task import graph_from_message, graph_to_message
 from gausslite.wire.update_sender import UplinkCounters
 
+MAX_DRAIN_S = 86400.0
+_AGES_KEPT = 1000
+
 
 @dataclass(frozen=True, slots=True)
 class MissionCheckpoint:
@@ -70,9 +73,6 @@ class SavedMission:
         except (GaussLiteError, DecodeError) as error:
             raise MapFileError(f"{path}: expected the state of an agent's mission: {error}") from error
         return cls(run, MissionCheckpoint(run.last_index, graph, requested_task, map_revision))
-
-
-MAX_DRAIN_S = 86400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,9 +177,6 @@ class MissionStateMachine:
             raise MismatchError(
                 f"frames: expected a mission that is mapping, got one that is {state.value}; call AssignTask"
             )
-
-
-_AGES_KEPT = 1000
 
 
 class Outcome(Enum):

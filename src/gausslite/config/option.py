@@ -16,6 +16,7 @@ from gausslite.domain.checks import require_instance
 
 _OPTION = "option"
 Settings = TypeVar("Settings")
+_MIN_SIMILARITY = 0.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,9 +166,6 @@ def _without_none(kind: Any) -> Any:
         kinds = [part for part in get_args(kind) if part is not type(None)]
         return kinds[0] if len(kinds) == 1 else kind
     return kind
-
-
-_MIN_SIMILARITY = 0.75
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

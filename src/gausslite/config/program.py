@@ -32,6 +32,7 @@ _CONFIG_HELP = (
     "read options from this file, and from variables such as GAUSSLITE_MAX_GAUSSIANS; variables override the file, "
     "flags override both"
 )
+_OWN_NAMES = frozenset({"config", "set", "print_config", PROGRAM, PARSER})
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,9 +272,6 @@ class Program:
             shown = _placeholder(declared, quoted=True) if computed is None else to_toml({"": as_plain(computed)})[3:]
             lines.append(f"# {key} = {shown}".rstrip())
         return "\n".join(lines) + "\n"
-
-
-_OWN_NAMES = frozenset({"config", "set", "print_config", PROGRAM, PARSER})
 
 
 def parse_options(

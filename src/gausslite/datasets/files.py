@@ -29,6 +29,11 @@ _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\x01\xd0-\xd7])", re.DOTALL)
 _JPEG_START, _JPEG_END = b"\xd8", b"\xd9"
 _SATURATED = np.iinfo(np.uint16).max
 _MAX_OF_12_BITS, _WHOLE_RANGE = (1 << 12) - 1, 1 << 16
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_NOT_A_NUMBER = re.compile(r"[-+]?(?:nan\(.*\)|1\.#(?:QNAN|SNAN|IND)\w*)|NA", re.IGNORECASE)
+"""NaN as the C library of Windows and tables of R write it."""
+_SEPARATORS, _OTHER_SEPARATORS = re.compile(r"[\s,;\"']+"), re.compile(r"[\s;\"']+")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+|[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,13 +233,6 @@ def require_pixel_count(location: str, width_px: int, height_px: int) -> None:
 
 def _size(image: NDArray[Any]) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
-
-
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_NOT_A_NUMBER = re.compile(r"[-+]?(?:nan\(.*\)|1\.#(?:QNAN|SNAN|IND)\w*)|NA", re.IGNORECASE)
-"""NaN as the C library of Windows and tables of R write it."""
-_SEPARATORS, _OTHER_SEPARATORS = re.compile(r"[\s,;\"']+"), re.compile(r"[\s;\"']+")
-_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+|[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 
 def read_text(path: Path) -> str:

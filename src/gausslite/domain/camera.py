@@ -26,6 +26,11 @@ _MAX_FOCAL_PX = 1e6
 """Larger focal lengths overflow float32 in products with pixels; real cameras have a hundredth of it."""
 _MAX_SLOPE = 100.0
 """Largest tangent of a ray's angle to the optical axis (89.4 degrees); steeper rays are not a pinhole camera."""
+MAX_READOUT_S = 0.1
+MAX_EXPOSURE_S = 0.1
+_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
+"""Limits as in the rasterizer."""
+_MAX_COEFFICIENT = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,12 +206,6 @@ def project(points_camera: Float32[ndarray, "n 3"], camera: Camera) -> Float32[n
     return np.stack([columns, rows], axis=1).astype(np.float32)
 
 
-MAX_READOUT_S = 0.1
-MAX_EXPOSURE_S = 0.1
-_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
-"""Limits as in the rasterizer."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
     """How a camera moves while its rows are exposed, one after the other from the first to the last.
@@ -269,9 +268,6 @@ class CameraMotion:
         """True if the image is that of a camera at rest: no velocity, or neither readout nor exposure time."""
         moves = bool(self.twist.linear_m_s.any() or self.twist.angular_rad_s.any())
         return not moves or (self.readout_s == 0.0 and self.exposure_s == 0.0)
-
-
-_MAX_COEFFICIENT = 1e3
 
 
 class LensModel(StrEnum):

@@ -17,6 +17,11 @@ from gausslite.domain.pose import transform_points
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
+MAX_OBJECTS_PER_AGENT = 200
+MAX_OBJECT_COORDINATE_M = 1e6
+_MAX_TIME_NS = 1 << 62
+_CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+
 
 class MatchBasis(StrEnum):
     """Why a noun is searched as these classes. SIMILAR classes are different things; NONE: there is no class."""
@@ -118,12 +123,6 @@ class NounReport:
 def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:
     """Return one message for each noun that cannot be found or may be a different thing."""
     return tuple(match.warning for match in matches if match.warning is not None)
-
-
-MAX_OBJECTS_PER_AGENT = 200
-MAX_OBJECT_COORDINATE_M = 1e6
-_MAX_TIME_NS = 1 << 62
-_CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 
 
 class ObjectRole(StrEnum):

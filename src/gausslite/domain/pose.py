@@ -18,6 +18,10 @@ UpAxis = tuple[float, float, float]
 
 _RIGIDITY_TOLERANCE = 1e-2
 _UNIT_TOLERANCE = 1e-3
+_MIN_BASELINE_S = 1e-6
+_TYPICAL_DISTANCE_M = 2.0
+_MAX_VELOCITY_CHANGE = 0.5
+_MAX_GAP_RATIO = 2.0
 
 
 def require_rigid(name: str, T: Float[ndarray, "4 4"]) -> None:
@@ -172,12 +176,6 @@ def pose_at(times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"], time_n
     gap_ns = int(times_ns[after] - times_ns[before])
     share = min(max((time_ns - int(times_ns[before])) / gap_ns, 0.0), 1.0) if gap_ns > 0 else 0.0
     return interpolate_poses(T[before], T[after], share)
-
-
-_MIN_BASELINE_S = 1e-6
-_TYPICAL_DISTANCE_M = 2.0
-_MAX_VELOCITY_CHANGE = 0.5
-_MAX_GAP_RATIO = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,10 @@ from gausslite.domain.pose import transform_of
 
 _MAX_TIME_OFFSET_S = 1.0
 _NAMES = ("lens", "readout", "offset", "exposure")
+_MAX_BASELINE_M = 1.0
+_MAX_ROTATION_DEG = 45.0
+_MAX_STD = 1000.0
+"""Upper bound of every standard deviation; its square is still a finite float."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +75,6 @@ class CameraCorrection:
         """True if images are used as recorded."""
         times_s = self.readout_s, self.time_offset_s, self.exposure_s
         return not any(times_s) and (self.lens is None or self.lens.is_identity)
-
-
-_MAX_BASELINE_M = 1.0
-_MAX_ROTATION_DEG = 45.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +136,6 @@ class DepthRegistration:
     def camera(self, width_px: int, height_px: int) -> Camera:
         """Return the colour camera (pixel centres at +0.5)."""
         return self.intrinsics.camera("depth registration", width_px, height_px)
-
-
-_MAX_STD = 1000.0
-"""Upper bound of every standard deviation; its square is still a finite float."""
 
 
 @dataclass(frozen=True, slots=True)

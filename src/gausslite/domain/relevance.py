@@ -20,6 +20,11 @@ _MAX_COORDINATE_M = 1e6
 _NEAR_M = 1e-3
 MIN_ROI_PIXELS = 64
 """A view with fewer region pixels does not show the region: it is not scored there, and pictures avoid it."""
+PointM = tuple[float, float, float]
+"""A point in the world in metres."""
+UNNAMED: Final = "object"
+"""The noun of an object that a person points at without a word."""
+NO_TARGET = -1
 
 
 @runtime_checkable
@@ -70,12 +75,6 @@ class TargetPoint:
     def ball(self) -> BallRegion:
         """Return the ball of the radius, of a metre without one. Raises InvalidInputError."""
         return BallRegion(self.point_m, 1.0 if self.radius_m is None else self.radius_m)
-
-
-PointM = tuple[float, float, float]
-"""A point in the world in metres."""
-UNNAMED: Final = "object"
-"""The noun of an object that a person points at without a word."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +153,6 @@ def _world_points(frame: Frame, window: tuple[slice, slice]) -> Float[ndarray, "
         moved = frame.motion.to_middle_row(points.reshape(-1, 3).astype(np.float64), pixel_shares)
         points = moved.astype(np.float32).reshape(points.shape)
     return transform_points(frame.T_world_camera, points)
-
-
-NO_TARGET = -1
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from typing import Final, Protocol, runtime_checkable
 from gausslite.domain.errors import TaskError
 
 _NUMBER_SUFFIX: Final = re.compile(r"_\d+$")
+EXAMPLE = "'Pick up the mug on the table'"
 
 
 class Predicate(StrEnum):
@@ -174,9 +175,6 @@ class TaskParser(Protocol):
 def noun_of(name: str) -> str:
     """Return the noun of an object's name: "block_2" is a "block"."""
     return _NUMBER_SUFFIX.sub("", name)
-
-
-EXAMPLE = "'Pick up the mug on the table'"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,14 @@ from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 
+MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
+BITS_PER_AXIS = 21
+_OFFSET = 1 << (BITS_PER_AXIS - 1)
+_MASK = (1 << BITS_PER_AXIS) - 1
+TILE_VOXELS = 16
+"""Voxels of a tile along each axis."""
+_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * BITS_PER_AXIS) for axis in range(3))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelBatch:
@@ -72,15 +80,6 @@ class RoiSubset:
             raise InvalidInputError(
                 f"subset message_seq and update_seq: expected at least 0, got {self.message_seq} and {self.update_seq}"
             )
-
-
-MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
-BITS_PER_AXIS = 21
-_OFFSET = 1 << (BITS_PER_AXIS - 1)
-_MASK = (1 << BITS_PER_AXIS) - 1
-TILE_VOXELS = 16
-"""Voxels of a tile along each axis."""
-_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * BITS_PER_AXIS) for axis in range(3))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,8 @@ from gausslite.fusion.update_log import PutOutcome
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id
 _PROBE = "", "storage-probe"
+ACKNOWLEDGEMENT_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+_LONGEST_WAIT_S = 5.0
 
 
 class StorageProbe:
@@ -39,10 +41,6 @@ class StorageProbe:
             self.is_writable = False
             raise
         self.is_writable = True
-
-
-ACKNOWLEDGEMENT_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
-_LONGEST_WAIT_S = 5.0
 
 
 class Acknowledgements:

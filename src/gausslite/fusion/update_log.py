@@ -40,6 +40,8 @@ _REWRITTEN = 4
 """How many times its own size a message may write anew; at 2, it would remove no more than it adds."""
 _LOADED_VOXELS = 1 << 16
 """Those of the rows that are read at a time."""
+_TileRow = tuple[int, int, EncodedVoxels]
+"""tile, number, voxels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +50,6 @@ class PutOutcome:
 
     accepted: Int64[ndarray, " a"]
     stale: Int64[ndarray, " s"]
-
-
-_TileRow = tuple[int, int, EncodedVoxels]
-"""tile, number, voxels."""
 
 
 @dataclass(slots=True)

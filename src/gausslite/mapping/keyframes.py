@@ -25,6 +25,11 @@ from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subse
 
 _ROI_MARGIN_PX = 5
 """Margin around the ROI within which tiles are rendered in the active phase: SSIM's window needs it."""
+_SSIM_WINDOW_PX = 11
+_DEPTH_STEP_PX = 8
+_ALL_MEASURED = 0.999
+_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
+"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
 
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
@@ -93,13 +98,6 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
         raise MapFileError("state pixel_weights: expected values in [0, 1], got others")
     (known_objects,) = get_counts(state, "known_objects", 1)
     return RelevanceMap(pixel_weights, get_array(state, "target", frame.depth_m.shape, np.int16).copy(), known_objects)
-
-
-_SSIM_WINDOW_PX = 11
-_DEPTH_STEP_PX = 8
-_ALL_MEASURED = 0.999
-_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
-"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,6 +34,15 @@ _RESERVED_VIEWS = 4.0
 """Background seeds leave free slots for this many more images."""
 _EDGE_EPSILON = 0.01
 """ε of GFD (Sec. III-C.3)."""
+_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
+_BLOCK_PX = 16
+_MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
+_MEDIAN_STRATIFIED = 0.89
+_MIN_SQUARED_M = 1e-7
+_REFERENCE_PIXELS = 640 * 480
+"""Image size of the seed counts in SeedingSettings."""
+_MIN_ROI_ROOM = 0.05
+"""Lowest density of ROI seeds relative to that of an empty map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,9 +117,6 @@ def _count_per_cell(rows: ndarray, columns: ndarray, shape: tuple[int, int]) -> 
     return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
 
 
-_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
-
-
 def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     """Return E(u, v) = ‖∇I(u, v)‖, the Sobel gradient magnitude of the luminance in [0, 1] (Sec. III-C.3)."""
     luminance = rgb @ _LUMINANCE
@@ -170,12 +176,6 @@ def _arrival_times(
     return arrival
 
 
-_BLOCK_PX = 16
-_MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
-_MEDIAN_STRATIFIED = 0.89
-_MIN_SQUARED_M = 1e-7
-
-
 def neighbour_distance_px(
     pixels: Int64[ndarray, " n"], pool: Bool[ndarray, "h w"], stratified: bool
 ) -> Float32[ndarray, " n"]:
@@ -210,12 +210,6 @@ def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
     by_rows = padded.reshape(-1, _BLOCK_PX, padded.shape[1]).sum(axis=1, dtype=np.uint16)
     blocks = by_rows.reshape(len(by_rows), -1, _BLOCK_PX).sum(axis=2, dtype=np.uint16).astype(np.float32)
     return np.asarray(cv2.boxFilter(blocks, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
-
-
-_REFERENCE_PIXELS = 640 * 480
-"""Image size of the seed counts in SeedingSettings."""
-_MIN_ROI_ROOM = 0.05
-"""Lowest density of ROI seeds relative to that of an empty map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,7 @@ refinement ends, and its last large steps would remain as noise. Over the 3DGS r
 region and 1.0 dB over the whole image of the simulated home. The decay gains 0.9 dB in the region (fitted views) on a
 real kitchen with the frames of two robots, and 0.2 dB on simulated homes.
 """
+BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +158,6 @@ class KeyframeSettings:
             buffer=max(1, int(share * self.buffer)),
             long_term_keyframes=min(self.long_term_keyframes, max(1, int(share * self.long_term_keyframes))),
         )
-
-
-BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)

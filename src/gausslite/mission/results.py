@@ -30,6 +30,14 @@ from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 
+MAP, _REPORT = "map.ply", "report.json"
+_FIRST_BYTES = 512
+PREVIEW = "preview.png"
+REPORT_PAGE = "report.html"
+"""Name of the page that `gausslite report` and `gausslite demo` write."""
+EVALUATION = "evaluation.json"
+MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
+
 
 def write_keyframes(folder: Path, keyframes: Sequence[Keyframe]) -> None:
     """Write keyframes.json. keyframes: oldest first. Raises StorageError."""
@@ -39,15 +47,6 @@ def write_keyframes(folder: Path, keyframes: Sequence[Keyframe]) -> None:
 def _view(keyframe: Keyframe) -> KeyframeView:
     frame, pixels = keyframe.frame, int(np.count_nonzero(keyframe.relevance.roi))
     return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)
-
-
-MAP, _REPORT = "map.ply", "report.json"
-_FIRST_BYTES = 512
-PREVIEW = "preview.png"
-REPORT_PAGE = "report.html"
-"""Name of the page that `gausslite report` and `gausslite demo` write."""
-EVALUATION = "evaluation.json"
-MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from gausslite.process import DeferredInterrupt
 
 OnCorrupt = Callable[[int, DatasetError | PoseError], None]
 """Gets the index and the error of each frame that cannot be read."""
+_NO_FRAME_INDEX = -1
 
 
 def region_file_note(spec: str, source: Source) -> str | None:
@@ -91,9 +92,6 @@ class CorruptFrames:
         self.count += 1
         self.first_error = self.first_error or error
         self._report(f"frame {index} skipped: {error}")
-
-
-_NO_FRAME_INDEX = -1
 
 
 @dataclass(slots=True)

@@ -44,6 +44,9 @@ _EDGE_RADIUS_PX = 2
 """Pixels by which an outline moves to a colour edge: bottles' precision 0.75 to 0.77, a mug's 0.84 to 0.88."""
 _EDGE_EPSILON = 1e-4
 """Variance of colour, in squared shares of the Lab range, below which an edge is noise."""
+# median distance to the middle of a disc, times this number, is its diameter
+_DISC_DIAMETERS: Final = 2.8
+Window = tuple[slice, slice]
 
 
 def is_in_large_part(points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, " n"]) -> Bool[ndarray, " n"]:
@@ -88,8 +91,6 @@ def _keys(voxels: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
 
 
 NEIGHBOUR_OFFSETS: Final = _neighbour_offsets()
-# median distance to the middle of a disc, times this number, is its diameter
-_DISC_DIAMETERS: Final = 2.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +297,6 @@ def _guided_filter(
     slope_mean = cv2.blur(slope, window)
     filtered: Float32[ndarray, "h w"] = (slope_mean * guide).sum(axis=-1) + cv2.blur(offset, window)
     return filtered
-
-
-Window = tuple[slice, slice]
 
 
 def mask_votes(

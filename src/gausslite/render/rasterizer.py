@@ -66,6 +66,8 @@ TANGENT_MARGIN = 1.3
 """Limit of the tangents in the Jacobian, as a factor of half the field of view."""
 MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
 """Limits of a moving camera's exposure time, in readouts, and of 1 - s readout / height."""
+_MIN_SCALE_M = 1e-7
+_MIN_OPACITY = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -386,10 +388,6 @@ def require_view(
 def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:
     if len(ids) and (ids[-1] >= n or (ids[1:] <= ids[:-1]).any()):
         raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
-
-
-_MIN_SCALE_M = 1e-7
-_MIN_OPACITY = 1e-6
 
 
 def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:

@@ -28,6 +28,19 @@ _DNS_NAMES, _URIS = "peer_dns", "peer_uri"
 _ROLE_PREFIX = "gausslite:role:"
 # every certificate of make_certificates.sh names it, for the health check
 _LOCALHOST = "localhost"
+_PERIOD_S = 60.0
+_MAX_ENTRIES = 1000
+_CONTRIBUTE = (
+    "JoinSession ContributeSubsets ContributeKeyframes ReportObjects KeepSession GetUpdateDigests LeaveSession"
+)
+_SHARE = "StorePart BeginAgent RemoveAgent ReadVoxels WatchFusedMap GetSessionStatus GetUpdateDigests CallHome"
+_BURST_S = 1.0
+MESSAGE_BYTES = 4096
+"""The cost of a message beside its own bytes; it limits the rate of small messages."""
+_RETRY_AFTER_S = 5.0
+_LARGE_BYTES, _UNREAD_BYTES, _UNREAD_OF_ONE = 1 << 16, 128 << 20, 32 << 20
+_READ_DEADLINE_S = 60.0
+_HANDSHAKE_S = 10.0
 
 
 class Role(StrEnum):
@@ -97,10 +110,6 @@ def _host(peer: str) -> str:
     return str(mapped or parsed)
 
 
-_PERIOD_S = 60.0
-_MAX_ENTRIES = 1000
-
-
 class RejectionLog:
     """Counts refusals by caller and reason. Use it from one thread. clock_s: the time in seconds."""
 
@@ -131,10 +140,6 @@ class RejectionLog:
 
 _ANY = frozenset({Role.ROBOT, Role.VIEWER, Role.OPERATOR})
 _ROBOT, _OPERATOR, _SERVER = (frozenset({role}) for role in (Role.ROBOT, Role.OPERATOR, Role.SERVER))
-_CONTRIBUTE = (
-    "JoinSession ContributeSubsets ContributeKeyframes ReportObjects KeepSession GetUpdateDigests LeaveSession"
-)
-_SHARE = "StorePart BeginAgent RemoveAgent ReadVoxels WatchFusedMap GetSessionStatus GetUpdateDigests CallHome"
 _METHODS = (
     ("Parser", _ANY, "ParseTask"),
     ("Agent", _OPERATOR, "AssignTask EndMission"),
@@ -297,9 +302,6 @@ def caller_or_connection(context: Any) -> str:
     return str(context.peer()) if caller.names is None and caller.is_local else caller.key
 
 
-_BURST_S = 1.0
-
-
 class TokenBucket:
     """A token bucket in bytes that fills with time; one batch may overdraw it."""
 
@@ -330,14 +332,6 @@ class TokenBucket:
     def spend(self, count: int) -> None:
         """Remove bytes from the bucket."""
         self._bytes -= count
-
-
-MESSAGE_BYTES = 4096
-"""The cost of a message beside its own bytes; it limits the rate of small messages."""
-_RETRY_AFTER_S = 5.0
-_LARGE_BYTES, _UNREAD_BYTES, _UNREAD_OF_ONE = 1 << 16, 128 << 20, 32 << 20
-_READ_DEADLINE_S = 60.0
-_HANDSHAKE_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,23 +42,6 @@ from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class SpooledKeyframe:
-    """A keyframe to send.
-
-    value: what the server gains, in units of kappa. coverage: what the agent needs to know of it after a restart; the
-    spool does not read it. data: the EncodedFrame. enqueue_count: how often this frame was enqueued.
-    """
-
-    frame_index: int
-    value: float
-    coverage: bytes
-    data: bytes
-    enqueue_count: int = 0
-
-
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
 _SLICE = 500
@@ -115,6 +98,21 @@ _SELECT_KEYFRAMES = "SELECT frame_index, value, coverage, data, enqueue_count FR
 _DUE_KEYFRAMES = """
 SELECT -value / length(data), frame_index, length(data), 1 FROM keyframes WHERE pending = 1 ORDER BY 1, 2
 """
+
+
+@dataclass(frozen=True, slots=True)
+class SpooledKeyframe:
+    """A keyframe to send.
+
+    value: what the server gains, in units of kappa. coverage: what the agent needs to know of it after a restart; the
+    spool does not read it. data: the EncodedFrame. enqueue_count: how often this frame was enqueued.
+    """
+
+    frame_index: int
+    value: float
+    coverage: bytes
+    data: bytes
+    enqueue_count: int = 0
 
 
 class _Due(NamedTuple):

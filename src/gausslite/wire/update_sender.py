@@ -22,6 +22,8 @@ from gausslite.wire.convert import enum_numbers
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 
 _log = logging.getLogger(__name__)
+_MIN_SUBSET_BYTES = 1 << 16
+_PURPOSES = enum_numbers(pb.Purpose, Purpose)
 
 
 def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
@@ -118,10 +120,6 @@ class SentPart:
     batch: SpoolBatch
     request: pb.ContributeSubsetsRequest
     update_seq: int
-
-
-_MIN_SUBSET_BYTES = 1 << 16
-_PURPOSES = enum_numbers(pb.Purpose, Purpose)
 
 
 class UpdateSender:
