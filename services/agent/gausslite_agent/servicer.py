@@ -104,11 +104,11 @@ class MapChangeLog:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentMapReader:
-    """Reads voxels that lead to a revision. key: what they are, in the cache of all watchers' encoded parts."""
+    """Reads voxels that lead to a revision."""
 
     revision: int
     batch: VoxelBatch
-    key: tuple[Hashable, ...]
+    key: tuple[Hashable, ...]  # what they are, in the cache of all watchers' encoded parts
     encode: Callable[[VoxelBatch], tuple[EncodedPart, ...]]
     cache: EncodedPartCache
 

@@ -32,16 +32,12 @@ _AGES_KEPT = 1000
 
 @dataclass(frozen=True, slots=True)
 class MissionCheckpoint:
-    """A mission at the time it was saved.
+    """A mission at the time it was saved."""
 
-    last_index: index of its last frame; graph: its task; requested_task: the task of the command line; map_revision:
-    the latest revision that was sent to watchers.
-    """
-
-    last_index: int
-    graph: TaskGraph
-    requested_task: str
-    map_revision: int
+    last_index: int  # index of its last frame
+    graph: TaskGraph  # its task
+    requested_task: str  # the task of the command line
+    map_revision: int  # the latest revision that was sent to watchers
 
     def state(self) -> State:
         """Return the arrays that are saved with the mapping run."""
@@ -77,10 +73,10 @@ class SavedMission:
 
 @dataclass(frozen=True, slots=True)
 class EndRequest:
-    """handover: also send the rest of the map; drain_s: the longest time for sending."""
+    """How a mission is to end."""
 
-    handover: bool
-    drain_s: float
+    handover: bool  # also send the rest of the map
+    drain_s: float  # the longest time for sending
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.drain_s) and 0 <= self.drain_s <= MAX_DRAIN_S):
@@ -89,18 +85,14 @@ class EndRequest:
 
 @dataclass(frozen=True, slots=True)
 class MissionSummary:
-    """The figures of a mission that has ended.
-
-    ended_by: why it ended early, None after its regular end. uplink: None without a fusion server. spool: file of the
-    data that was left, None if it is in memory.
-    """
+    """The figures of a mission that has ended."""
 
     frames: int
     hz: float
     gaussians: int
-    ended_by: str | None
-    uplink: UplinkCounters | None
-    spool: Path | None
+    ended_by: str | None  # why it ended early, None after its regular end
+    uplink: UplinkCounters | None  # None without a fusion server
+    spool: Path | None  # file of the data that was left, None if it is in memory
 
     @property
     def is_complete(self) -> bool:
@@ -190,31 +182,24 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameReport:
-    """The outcome of one frame; reason: why it was not mapped.
-
-    seconds: its processing time; age_s: time from its arrival until it was mapped, including its wait in the queue.
-    """
+    """The outcome of one frame."""
 
     index: int
     outcome: Outcome
-    reason: str = ""
+    reason: str = ""  # why it was not mapped
     iterations: int = 0
     gaussians: int = 0
     roi_share: float = 0.0
-    seconds: float = 0.0
-    age_s: float = 0.0
+    seconds: float = 0.0  # its processing time
+    age_s: float = 0.0  # time from its arrival until it was mapped, including its wait in the queue
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerStatus:
     """Totals since the start of the agent.
 
-    busy_s: time of perception and mapping. under_trained, publishing_skipped, seeding_skipped: frames whose time was
-    too short for all of it. max_detection_lag: longest delay of a detection, in frames. keyframes_reevaluated:
-    keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
-    latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
-    notes: messages of the relevance estimator. objects: the confirmed objects of the task. nouns: what is searched for
-    each noun, and what was detected. team_gaussians: Gaussians inserted from the fused map. localisation: of the robot.
+    under_trained, publishing_skipped, seeding_skipped: frames whose time was too short for all of it. correction: the
+    odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
     """
 
     graph: TaskGraph | None = None
@@ -225,23 +210,23 @@ class WorkerStatus:
     dropped: int = 0
     rejected: int = 0
     iterations: int = 0
-    busy_s: float = 0.0
+    busy_s: float = 0.0  # time of perception and mapping
     roi_share_sum: float = 0.0
     idle_iterations: int = 0
     under_trained: int = 0
     publishing_skipped: int = 0
     seeding_skipped: int = 0
-    max_detection_lag: int = 0
-    keyframes_reevaluated: int = 0
-    publish_error: str = ""
-    ages_s: tuple[float, ...] = ()
-    notes: tuple[str, ...] = ()
+    max_detection_lag: int = 0  # longest delay of a detection, in frames
+    keyframes_reevaluated: int = 0  # keyframes evaluated for a new task
+    publish_error: str = ""  # why the uplink refused the newest changes
+    ages_s: tuple[float, ...] = ()  # ages of the latest mapped frames
+    notes: tuple[str, ...] = ()  # messages of the relevance estimator
     correction: PoseCorrection | None = None
     corrected_at_s: float = 0.0
-    objects: tuple[ObjectLandmark, ...] = ()
-    nouns: tuple[NounReport, ...] = ()
-    team_gaussians: int = 0
-    localisation: LocalisationState = LocalisationState.TRACKED
+    objects: tuple[ObjectLandmark, ...] = ()  # the confirmed objects of the task
+    nouns: tuple[NounReport, ...] = ()  # what is searched for each noun, and what was detected
+    team_gaussians: int = 0  # Gaussians inserted from the fused map
+    localisation: LocalisationState = LocalisationState.TRACKED  # of the robot
 
     @property
     def noun_notes(self) -> tuple[str, ...]:

@@ -37,11 +37,11 @@ _OWN_NAMES = frozenset({"config", "set", "print_config", PROGRAM, PARSER})
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """A value that a layer sets, and how messages name it. is_toml: the value has a type of TOML."""
+    """A value that a layer sets, and how messages name it."""
 
     value: Any
     origin: str
-    is_toml: bool = False
+    is_toml: bool = False  # the value has a type of TOML
 
 
 _Layer = Mapping[str, _Given]
@@ -49,14 +49,11 @@ _Layer = Mapping[str, _Given]
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """The options of a program or command, by key.
-
-    flags: keys of the options that are also flags, in the order of the help; positional: those without dashes.
-    """
+    """The options of a program or command, by key."""
 
     options: Mapping[str, OptionField]
-    flags: tuple[str, ...] = ()
-    positional: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()  # keys of the options that are also flags, in the order of the help
+    positional: tuple[str, ...] = ()  # those without dashes
 
     @classmethod
     def of(

@@ -45,17 +45,13 @@ def find_in_or_above(folder: Path, name: str) -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class FolderCamera:
-    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none.
-
-    note: message that names a file of another folder; empty if the camera's file is the recording's own.
-    depth_registered: whether each depth pixel belongs to the colour pixel at its place, None if it is not stated.
-    """
+    """Camera that a folder's files state."""
 
     camera: Camera
-    units_per_metre: float | None = None
+    units_per_metre: float | None = None  # of the depth images, None if the file states none
     lens: Lens | None = None
-    note: str = ""
-    depth_registered: bool | None = None
+    note: str = ""  # message that names a file of another folder; empty if the camera's file is the recording's own
+    depth_registered: bool | None = None  # whether each depth pixel belongs to the colour pixel at its place
 
 
 class CameraReader(Protocol):

@@ -45,12 +45,12 @@ class DepthUnits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdImage:
-    """A colour and a depth image of one size, with their camera; recorded_rgb: as in Frame."""
+    """A colour and a depth image of one size, with their camera."""
 
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
     camera: Camera
-    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
+    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None  # as in Frame
 
     def frame(self, number: int, time_ns: int, T_world_camera: Float64[ndarray, "4 4"]) -> Frame:
         """Return the frame of these images. Raises PoseError, InvalidInputError."""

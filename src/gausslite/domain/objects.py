@@ -42,8 +42,7 @@ class NounMatch:
     """The classes that a detector searches for one noun of a task.
 
     similarity: cosine of the noun's and the class's centred text features, None without a comparison. accepted: False
-    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known:
-    the ground truth's regions, or the classes near to a noun without one. min_score: from which a detection counts.
+    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched.
     """
 
     noun: str
@@ -51,8 +50,8 @@ class NounMatch:
     classes: tuple[str, ...] = ()
     similarity: float | None = None
     accepted: bool = True
-    known: tuple[str, ...] = ()
-    min_score: float | None = None
+    known: tuple[str, ...] = ()  # the ground truth's regions, or the classes near to a noun without one
+    min_score: float | None = None  # from which a detection counts
 
     @property
     def is_searched(self) -> bool:
@@ -90,17 +89,13 @@ class NounMatch:
 
 @dataclass(frozen=True, slots=True)
 class NounReport:
-    """A noun's match, and what has been detected of it so far.
-
-    detections: their number in all frames. best_score: the highest, in best_frame, below thresholds too; 0 and None
-    without any. objects: the number of confirmed ones. rival: the class that the detections rather show, or None.
-    """
+    """A noun's match, and what has been detected of it so far."""
 
     match: NounMatch
-    detections: int = 0
-    best_score: float = 0.0
-    objects: int = 0
-    rival: str | None = None
+    detections: int = 0  # their number in all frames
+    best_score: float = 0.0  # the highest, in best_frame, below thresholds too; 0 and None without any
+    objects: int = 0  # the number of confirmed ones
+    rival: str | None = None  # the class that the detections rather show, or None
     best_frame: int | None = None
 
     def describe(self) -> str:
@@ -137,16 +132,16 @@ class ObjectRole(StrEnum):
 class ObjectLandmark:
     """One object of one agent or of a team; noun is a noun phrase of a task.
 
-    centroid_m: mean of its observed surface cells; extent_m: their axis-aligned box. confidence: 0 to 1. first_seen_ns,
-    last_seen_ns: capture times of the first and the latest frame that showed it. Raises InvalidInputError.
+    first_seen_ns, last_seen_ns: capture times of the first and the latest frame that showed it. Raises
+    InvalidInputError.
     """
 
     object_id: str
     noun: str
     role: ObjectRole
-    centroid_m: tuple[float, float, float]
-    extent_m: AxisAlignedBox
-    confidence: float
+    centroid_m: tuple[float, float, float]  # mean of its observed surface cells
+    extent_m: AxisAlignedBox  # axis-aligned box of these cells
+    confidence: float  # 0 to 1
     first_seen_ns: int
     last_seen_ns: int
 
@@ -215,11 +210,11 @@ class ObjectReport:
 
 @dataclass(frozen=True, slots=True)
 class ObjectObserver:
-    """One agent's observation of a team's object; target: index of the noun in the agent's task, -1 for an anchor."""
+    """One agent's observation of a team's object."""
 
     agent_id: str
     object_id: str
-    target: int
+    target: int  # index of the noun in the agent's task, -1 for an anchor
     confidence: float
     first_seen_ns: int
     last_seen_ns: int

@@ -127,11 +127,11 @@ def upward_axis(T_world_camera: Float64[ndarray, "t 4 4"]) -> UpAxis:
 class PoseCorrection:
     """The latest correction of the odometry: T_map_camera = T_map_odometry · T_odometry_camera.
 
-    capture_time_ns: time of the frame that it was estimated from. translation_std_m, rotation_std_deg: by how much the
-    corrections of successive frames differ, along and about each axis: the error of using it for the next frame.
+    translation_std_m, rotation_std_deg: by how much the corrections of successive frames differ, along and about each
+    axis: the error of using it for the next frame.
     """
 
-    capture_time_ns: int
+    capture_time_ns: int  # time of the frame that it was estimated from
     T_map_odometry: Float64[ndarray, "4 4"]
     translation_std_m: float
     rotation_std_deg: float

@@ -26,14 +26,13 @@ class CameraCorrection:
     """How recorded images differ from those of an ideal camera.
 
     readout_s: time from the exposure of the first row to that of the last; negative if rows are read from the bottom.
-    time_offset_s: add it to an image's stamp to get the trajectory's time of its middle row. exposure_s: each row's
-    exposure time, which blurs moving images; 0 for none. Raises InvalidInputError.
+    Raises InvalidInputError.
     """
 
     lens: Lens | None = None
     readout_s: float = 0.0
-    time_offset_s: float = 0.0
-    exposure_s: float = 0.0
+    time_offset_s: float = 0.0  # add it to an image's stamp to get the trajectory's time of its middle row
+    exposure_s: float = 0.0  # each row's exposure time, which blurs moving images; 0 for none
 
     def __post_init__(self) -> None:
         for name, value, low, high in (

@@ -165,19 +165,18 @@ class Rival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class.
+    """One detected object in one image. box_px is (left, top, right, bottom).
 
     is_weak: the score is below the detector's threshold. It supports an object that other frames found, nothing else.
-    is_exact: the mask is ground truth, not a network's.
     """
 
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]
     mask: Bool[ndarray, "h w"]
-    rival: Rival | None = None
+    rival: Rival | None = None  # None without another class
     is_weak: bool = False
-    is_exact: bool = False
+    is_exact: bool = False  # the mask is ground truth, not a network's
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,9 +192,9 @@ class DetectedBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedImage:
-    """What the detector has found in one image, objects that the task leaves out included. index: of the frame."""
+    """What the detector has found in one image, objects that the task leaves out included."""
 
-    index: int
+    index: int  # of the frame
     rgb: UInt8[ndarray, "h w 3"]
     boxes: tuple[DetectedBox, ...]
 
@@ -216,16 +215,15 @@ class DetectedImage:
 class CameraView:
     """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
 
-    roi: True in the task's region. times_ns: the capture times of the path, oldest first. detected: what the detector
-    found in the image on which it ran last; None without a detector.
+    detected: what the detector found in the image on which it ran last; None without a detector.
     """
 
     rgb: UInt8[ndarray, "h w 3"]
-    roi: Bool[ndarray, "h w"]
+    roi: Bool[ndarray, "h w"]  # True in the task's region
     camera: Camera
     frame_index: int
     T_world_camera: Float64[ndarray, "4 4"]
-    times_ns: Int64[ndarray, " t"]
+    times_ns: Int64[ndarray, " t"]  # the capture times of the path, oldest first
     path: Float64[ndarray, "t 4 4"]
     keyframes: Float64[ndarray, "k 4 4"]
     detected: DetectedImage | None = None
@@ -233,15 +231,11 @@ class CameraView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelevanceMap:
-    """Relevance of one frame.
+    """Relevance of one frame."""
 
-    pixel_weights: the paper's w(u, v), in [0, 1]. target: for each pixel, the index of its target in TaskGraph.targets,
-    -1 for none. known_objects: how many objects of the task were known when this was estimated.
-    """
-
-    pixel_weights: Float32[ndarray, "h w"]
-    target: Int16[ndarray, "h w"]
-    known_objects: int = 0
+    pixel_weights: Float32[ndarray, "h w"]  # the paper's w(u, v), in [0, 1]
+    target: Int16[ndarray, "h w"]  # for each pixel, the index of its target in TaskGraph.targets, -1 for none
+    known_objects: int = 0  # how many objects of the task were known when this was estimated
 
     def __post_init__(self) -> None:
         require_array("relevance pixel_weights", self.pixel_weights, (None, None), np.float32)

@@ -65,13 +65,13 @@ class Superlative(StrEnum):
 class Relation:
     """`predicate(target, anchor)`; both are names of the graph.
 
-    negated: the relation does not hold. min_m, max_m: bounds of the distance to the anchor; equal bounds mean "about".
+    min_m, max_m: bounds of the distance to the anchor; equal bounds mean "about".
     """
 
     predicate: Predicate
     target: str
     anchor: str
-    negated: bool = False
+    negated: bool = False  # the relation does not hold
     min_m: float | None = None
     max_m: float | None = None
 
@@ -103,7 +103,6 @@ class TaskGraph:
 
     Targets, anchors and excluded objects are names: a noun, with the suffix _2, _3, ... for a further object of that
     noun with other attributes. roles has one role per target; an empty tuple means that every target is an object.
-    excluded: objects to leave out. context: rooms and places, which locate nothing. See docs/guides/task.md.
     """
 
     task_id: str
@@ -114,8 +113,8 @@ class TaskGraph:
     warnings: tuple[str, ...] = ()
     roles: tuple[TargetRole, ...] = ()
     attributes: tuple[ObjectAttributes, ...] = ()
-    excluded: tuple[str, ...] = ()
-    context: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()  # objects to leave out
+    context: tuple[str, ...] = ()  # rooms and places, which locate nothing. See docs/guides/task.md
 
     def __post_init__(self) -> None:
         if not self.roles:

@@ -61,16 +61,12 @@ class VoxelBatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoiSubset:
-    """One message of an agent: its updates of some voxels.
-
-    update_seq: sequence number of these updates; in each voxel, the update with the highest one is the latest.
-    message_seq: number of the message in its session, for cumulative acknowledgements.
-    """
+    """One message of an agent: its updates of some voxels."""
 
     agent_id: str
     session_id: str
-    message_seq: int
-    update_seq: int
+    message_seq: int  # number of the message in its session, for cumulative acknowledgements
+    update_seq: int  # sequence number of these updates; in each voxel, the update with the highest one is the latest
     batch: VoxelBatch
 
     def __post_init__(self) -> None:

@@ -56,14 +56,13 @@ class RefinedMap:
 class StoredRefinement:
     """A refined map without the voxels that have changed, and a hash of the vote's winner in every unchanged voxel.
 
-    After a restart, the hashes tell which voxels have changed since. voted_keys are ascending. sources: the agents
-    whose keyframes shaped it.
+    After a restart, the hashes tell which voxels have changed since. voted_keys are ascending.
     """
 
     batch: VoxelBatch
     voted_keys: Int64[ndarray, " v"]
     winner_hashes: UInt64[ndarray, " v"]
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # the agents whose keyframes shaped it
 
     def without(self, changed: Int64[ndarray, " c"]) -> StoredRefinement:
         """Return the refinement without these voxels, which changed since it started."""

@@ -62,12 +62,10 @@ class RefineSettings:
 
 @dataclass(frozen=True, slots=True)
 class RefineProgress:
-    """The state of a refinement after `iteration` of `iterations`; left_out: agents of which
-    keyframes disagree with the vote, and how many.
-    """
+    """The state of a refinement after `iteration` of `iterations`."""
 
     iteration: int
     iterations: int
     loss: float
     gaussians: int
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # agents whose keyframes disagree with the vote, and how many of them

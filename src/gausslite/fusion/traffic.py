@@ -106,9 +106,9 @@ class Acknowledgements:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCounters:
-    """Messages of one agent. last_seen_ns: time of its latest subset, 0 before the first."""
+    """Messages of one agent."""
 
-    last_seen_ns: int = 0
+    last_seen_ns: int = 0  # time of its latest subset, 0 before the first
     roi_bytes: int = 0
     handover_bytes: int = 0
     subsets_accepted: int = 0

@@ -156,15 +156,12 @@ class UpdateChecks:
 
 @dataclass(slots=True, eq=False)
 class PendingUpdate:
-    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices.
-
-    future: has its outcome, or its content where it is only decoded.
-    """
+    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices."""
 
     session_id: str
     agent_id: str
     message: bytes | EncodedSubset
-    future: Future[Any] = field(default_factory=Future)
+    future: Future[Any] = field(default_factory=Future)  # has its outcome, or its content where it is only decoded
     next_voxel: int = 0
     outcomes: list[PutOutcome] = field(default_factory=list)
     queued_s: float = field(default_factory=time.monotonic)

@@ -51,29 +51,24 @@ _EXTENT_PER_DEPTH = 1.0 / 3.0
 
 @dataclass(frozen=True, slots=True)
 class MappedFrame:
-    """Result of mapping one frame: Gaussians added by seeding, iterations, and Gaussians in the map afterwards.
-
-    skipped: why the frame was not mapped, or None. T_world_camera: the pose that it was mapped with; None if skipped.
-    anchor: number of the keyframe that it follows. T_corrected_earlier: motion of each keyframe, in world axes, if a
-    loop corrected the map after this frame.
-    """
+    """Result of mapping one frame."""
 
     index: int
-    seeded: int
+    seeded: int  # Gaussians added by seeding
     iterations: int
-    gaussians: int
-    skipped: str | None = None
-    T_world_camera: Float64[ndarray, "4 4"] | None = None
-    anchor: int = 0
-    T_corrected_earlier: Float64[ndarray, "k 4 4"] | None = None
+    gaussians: int  # in the map afterwards
+    skipped: str | None = None  # why the frame was not mapped, or None
+    T_world_camera: Float64[ndarray, "4 4"] | None = None  # the pose that it was mapped with; None if skipped
+    anchor: int = 0  # number of the keyframe that it follows
+    T_corrected_earlier: Float64[ndarray, "k 4 4"] | None = None  # motion of each keyframe, world axes, by a loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameView:
-    """A frame to map, with its pose, and the map rendered from there: None if it is empty or was not rendered."""
+    """A frame to map, and what the map shows from its pose."""
 
     frame: Frame
-    rendered: RenderedView | None = None
+    rendered: RenderedView | None = None  # None if the map is empty or was not rendered
 
 
 class GaussianMapper:

@@ -214,28 +214,21 @@ def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeedingContext:
-    """State of the map before seeding.
+    """State of the map before seeding."""
 
-    free_slots: Gaussians that still fit under the cap. rendered: the map rendered from the frame's pose, None if the
-    map is empty. active_means_m: means of the active Gaussians. max_active: how many may be active; None: any number.
-    """
-
-    free_slots: int
-    rendered: RenderedView | None
-    active_means_m: Float32[ndarray, "n 3"]
-    max_active: int | None = None
+    free_slots: int  # Gaussians that still fit under the cap
+    rendered: RenderedView | None  # the map rendered from the frame's pose, None if the map is empty
+    active_means_m: Float32[ndarray, "n 3"]  # means of the active Gaussians
+    max_active: int | None = None  # how many may be active; None: any number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel).
-
-    anchor: number of the keyframe that they follow when poses are corrected.
-    """
+    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel)."""
 
     roi: Gaussians
     background: Gaussians
-    anchor: int = NO_ANCHOR
+    anchor: int = NO_ANCHOR  # number of the keyframe that they follow when poses are corrected
 
 
 @dataclass(frozen=True, slots=True, eq=False)

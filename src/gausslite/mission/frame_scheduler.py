@@ -71,17 +71,13 @@ class SchedulerSettings:
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """Time of one frame in total and by stage, and its skipped stages.
-
-    under_trained: it trained fewer than min_iterations. late: it ended after its deadline and the slack, so that the
-    rate falls.
-    """
+    """Time of one frame in total and by stage, and its skipped stages."""
 
     seconds: float
     stages_s: Mapping[Stage, float]
     skipped_stages: frozenset[SkippableStage]
-    under_trained: bool
-    late: bool = False
+    under_trained: bool  # it trained fewer than min_iterations
+    late: bool = False  # it ended after its deadline and the slack, so that the rate falls
 
 
 class FrameScheduler:

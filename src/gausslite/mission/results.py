@@ -51,14 +51,11 @@ def _view(keyframe: Keyframe) -> KeyframeView:
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """A kind of file that a command writes; mark: bytes that stand among the first ones of each such file.
-
-    suffix: by which other tools know the kind; empty if a file may have any name.
-    """
+    """A kind of file that a command writes."""
 
     name: str
-    mark: bytes
-    suffix: str = ""
+    mark: bytes  # bytes that stand among the first ones of each such file
+    suffix: str = ""  # by which other tools know the kind; empty if a file may have any name
 
     def require_replaceable(self, path: Path) -> None:
         """Raise StorageError for another suffix, or if the path holds a file of another kind, which would be lost."""

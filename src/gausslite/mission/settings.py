@@ -113,12 +113,7 @@ class SceneInfo:
 
 @dataclass(frozen=True, slots=True)
 class SourceSettings:
-    """A sequence and which of its frames a mission uses.
-
-    depth_registration: the colour camera to register depth to, None if depth is registered already.
-    camera_correction: lens, rolling shutter and time offset, None for the lens of the files. require_poses: False also
-    uses frames without a pose, for tracking.
-    """
+    """A sequence and which of its frames a mission uses."""
 
     spec: str = option(
         MISSING,
@@ -151,7 +146,7 @@ class SourceSettings:
         plain_type=str,
         convert=read_registration,
         to_plain=str,
-    )
+    )  # the colour camera to register depth to, None if depth is registered already
     camera_correction: CameraCorrection | None = option(
         None,
         CORRECTION_HELP,
@@ -159,8 +154,8 @@ class SourceSettings:
         plain_type=str,
         convert=read_correction,
         to_plain=write_correction,
-    )
-    require_poses: bool = True
+    )  # lens, rolling shutter and time offset, None for the lens of the files
+    require_poses: bool = True  # False also uses frames without a pose, for tracking
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,10 +49,8 @@ _MAX_REEVALUATED = 3
 class FrameOutcome:
     """Result of one frame.
 
-    skipped: why the frame was not mapped, else None. changed_roi: the changed voxels of the task's region; None
-    without a tracker, for a skipped frame, and if publishing waits for the next frame. detection_lag_frames: age of
-    the detection that finished during this frame. reevaluation: the earlier keyframes evaluated for a new task.
-    recovered: outcomes of frames that waited for the robot's place and are mapped now, before this one.
+    changed_roi: the changed voxels of the task's region; None without a tracker, for a skipped frame, and if publishing
+    waits for the next frame.
     """
 
     index: int
@@ -60,12 +58,12 @@ class FrameOutcome:
     gaussians: int
     roi_share: float
     timing: FrameTiming
-    skipped: str | None = None
+    skipped: str | None = None  # why the frame was not mapped, else None
     changed_roi: VoxelBatch | None = None
-    detection_lag_frames: int | None = None
-    reevaluation: Reevaluation = field(default_factory=Reevaluation)
+    detection_lag_frames: int | None = None  # age of the detection that finished during this frame
+    reevaluation: Reevaluation = field(default_factory=Reevaluation)  # the earlier keyframes evaluated for a new task
     localisation: LocalisationState = LocalisationState.TRACKED
-    recovered: tuple[FrameOutcome, ...] = ()
+    recovered: tuple[FrameOutcome, ...] = ()  # of frames that waited for the robot's place, mapped before this one
 
     @property
     def mapped(self) -> tuple[FrameOutcome, ...]:

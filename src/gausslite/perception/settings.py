@@ -64,11 +64,10 @@ class EvidenceSettings:
 class RelevanceTrackerSettings:
     """All sections, and when to detect: the limits of the camera's motion (a comment in Sec. III-B.2) and of frames.
 
-    up_axis: up in the world frame, by default that of a level first camera. max_translation_m, max_rotation_deg,
-    max_frames: between two detections.
+    max_translation_m, max_rotation_deg, max_frames: between two detections.
     """
 
-    up_axis: UpAxis = (0.0, -1.0, 0.0)
+    up_axis: UpAxis = (0.0, -1.0, 0.0)  # up in the world frame, by default that of a level first camera
     max_translation_m: float = 1.0
     max_rotation_deg: float = 15.0
     max_frames: int = 5

@@ -75,11 +75,10 @@ class Subset:
     """The tiles and rows of a partial rendering; None selects all.
 
     tiles: True for each 16x16 tile to render, row-major from the top left; all other pixels are 0, with alpha 0.
-    ids: row numbers to render, ascending (active-only rendering).
     """
 
     tiles: Bool[ndarray, "th tw"] | None = None
-    ids: UInt32[ndarray, " m"] | None = None
+    ids: UInt32[ndarray, " m"] | None = None  # row numbers to render, ascending (active-only rendering)
 
 
 FULL_FRAME = Subset()
@@ -109,15 +108,14 @@ class Rendering:
 class SplatGradients:
     """Gradients of a scalar function of the rendered images.
 
-    d_rows: of the parameters; columns 14 and 15 are zero. d_twist: of the camera pose, for
-    T_camera_world ← exp(twist) T_camera_world with twist = (translation 3, rotation 3) in the camera frame.
-    visible: the visible rows, ascending. mean_2d_grad_norm: for each visible row, the norm of the gradient of its
-    2D mean, in units of half the image width and height.
+    d_twist: of the camera pose, for T_camera_world ← exp(twist) T_camera_world with twist = (translation 3, rotation 3)
+    in the camera frame. mean_2d_grad_norm: for each visible row, the norm of the gradient of its 2D mean, in units of
+    half the image width and height.
     """
 
-    d_rows: Float32[ndarray, "n 16"]
+    d_rows: Float32[ndarray, "n 16"]  # of the parameters; columns 14 and 15 are zero
     d_twist: Float64[ndarray, "6"]
-    visible: UInt32[ndarray, " m"]
+    visible: UInt32[ndarray, " m"]  # the visible rows, ascending
     mean_2d_grad_norm: Float32[ndarray, " m"]
 
 
@@ -189,13 +187,10 @@ class AdamSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UpdateCounter:
-    """Counters of row updates: a step adds 1 to `counts` for each row that it changes and that `mask` selects.
-
-    mask: None selects all rows.
-    """
+    """Counters of row updates: a step adds 1 to `counts` for each row that it changes and that `mask` selects."""
 
     counts: UInt32[ndarray, " n"]
-    mask: Bool[ndarray, " n"] | None = None
+    mask: Bool[ndarray, " n"] | None = None  # None selects all rows
 
 
 @runtime_checkable

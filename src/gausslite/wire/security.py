@@ -54,9 +54,9 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """The other end of a call. host: its IP address, or "unix"; names, roles: of its certificate, None without one."""
+    """The other end of a call. names, roles: of its certificate, None without one."""
 
-    host: str
+    host: str  # its IP address, or "unix"
     names: frozenset[str] | None = None
     roles: frozenset[Role] = frozenset()
 
@@ -336,17 +336,12 @@ class TokenBucket:
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Limits of a server.
+    """Limits of a server; the number of connections is that of all callers together."""
 
-    calls: open calls of one caller, streams and watchers included; kbps: bandwidth of one caller's requests, in
-    kilobits per second; connections: of all callers together; idle_s: time after which a connection without an open
-    call is closed.
-    """
-
-    calls: int = 64
-    kbps: int = 200_000
+    calls: int = 64  # open calls of one caller, streams and watchers included
+    kbps: int = 200_000  # bandwidth of one caller's requests, in kilobits per second
     connections: int = option(1000, "largest number of connections", key="limit-connections", low=1)
-    idle_s: int = 60
+    idle_s: int = 60  # time after which a connection without an open call is closed
 
     def __post_init__(self) -> None:
         check_options(self)

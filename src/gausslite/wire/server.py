@@ -55,15 +55,12 @@ _ARITY = {False: "unary", True: "stream"}
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A servicer's full name, a function that adds it to a server, and its checks.
-
-    check: may block; it runs in a thread. check_progress: must not block; it is called every second.
-    """
+    """A servicer's full name, a function that adds it to a server, and its checks."""
 
     name: str
     register: Callable[[grpc.aio.Server], None]
-    check: Check = lambda: None
-    check_progress: Check = lambda: None
+    check: Check = lambda: None  # may block; it runs in a thread
+    check_progress: Check = lambda: None  # must not block; it is called every second
 
 
 class ReadinessWatch:

@@ -102,17 +102,13 @@ SELECT -value / length(data), frame_index, length(data), 1 FROM keyframes WHERE 
 
 @dataclass(frozen=True, slots=True)
 class SpooledKeyframe:
-    """A keyframe to send.
-
-    value: what the server gains, in units of kappa. coverage: what the agent needs to know of it after a restart; the
-    spool does not read it. data: the EncodedFrame. enqueue_count: how often this frame was enqueued.
-    """
+    """A keyframe to send."""
 
     frame_index: int
-    value: float
-    coverage: bytes
-    data: bytes
-    enqueue_count: int = 0
+    value: float  # what the server gains, in units of kappa
+    coverage: bytes  # what the agent needs to know of it after a restart; the spool does not read it
+    data: bytes  # the EncodedFrame
+    enqueue_count: int = 0  # how often this frame was enqueued
 
 
 class _Due(NamedTuple):
