@@ -109,8 +109,8 @@ class AgentMapReader:
     revision: int
     batch: VoxelBatch
     key: tuple[Hashable, ...]  # what they are, in the cache of all watchers' encoded parts
-    encode: Callable[[VoxelBatch], tuple[EncodedPart, ...]]
-    cache: EncodedPartCache
+    encode: Callable[[VoxelBatch], tuple[EncodedPart, ...]]  # to messages of limited size
+    cache: EncodedPartCache  # of all watchers
 
     def snapshot(self) -> tuple[int, Parts]:
         """Return the revision and, in parts, the voxels: the whole map."""

@@ -87,8 +87,8 @@ class EndRequest:
 class MissionSummary:
     """The figures of a mission that has ended."""
 
-    frames: int
-    hz: float
+    frames: int  # mapped ones
+    hz: float  # mapped frames per second of their processing
     gaussians: int
     ended_by: str | None  # why it ended early, None after its regular end
     uplink: UplinkCounters | None  # None without a fusion server
@@ -184,12 +184,12 @@ class Outcome(Enum):
 class FrameReport:
     """The outcome of one frame."""
 
-    index: int
+    index: int  # number in the sequence
     outcome: Outcome
     reason: str = ""  # why it was not mapped
-    iterations: int = 0
-    gaussians: int = 0
-    roi_share: float = 0.0
+    iterations: int = 0  # of training
+    gaussians: int = 0  # in the map afterwards
+    roi_share: float = 0.0  # of the pixels
     seconds: float = 0.0  # its processing time
     age_s: float = 0.0  # time from its arrival until it was mapped, including its wait in the queue
 
@@ -202,17 +202,17 @@ class WorkerStatus:
     odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
     """
 
-    graph: TaskGraph | None = None
-    map_revision: int = 0
-    gaussians: int = 0
+    graph: TaskGraph | None = None  # of the current task
+    map_revision: int = 0  # grows with each change of the map
+    gaussians: int = 0  # in the map
     mapped: int = 0
-    skipped: int = 0
-    dropped: int = 0
-    rejected: int = 0
+    skipped: int = 0  # frames with a defect or without a place
+    dropped: int = 0  # frames that newer ones replaced in the queue
+    rejected: int = 0  # invalid frames
     iterations: int = 0
     busy_s: float = 0.0  # time of perception and mapping
-    roi_share_sum: float = 0.0
-    idle_iterations: int = 0
+    roi_share_sum: float = 0.0  # over the mapped frames; divided by their number, the mean
+    idle_iterations: int = 0  # iterations while no frame waited
     under_trained: int = 0
     publishing_skipped: int = 0
     seeding_skipped: int = 0

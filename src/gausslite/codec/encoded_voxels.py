@@ -187,7 +187,7 @@ class EncodedSubset:
     """One message of an agent, see RoiSubset, as a store keeps it."""
 
     agent_id: str
-    message_seq: int
+    message_seq: int  # see RoiSubset
     update_seq: int
     voxels: EncodedVoxels
 

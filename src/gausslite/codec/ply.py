@@ -64,10 +64,10 @@ class StoredMap:
     """
 
     gaussians: Gaussians
-    world_frame: str
+    world_frame: str  # empty for an unnamed one
     harmonics: Float32[ndarray, "n 3 k"]
     left_out: int = 0  # how many rows are left out, and why in words; empty for a whole file
-    reason: str = ""
+    reason: str = ""  # why they are left out, in words
 
 
 def write_ply(

@@ -57,7 +57,7 @@ class OptionField:
 
     key: str
     field_name: str
-    field_type: Any
+    field_type: Any  # as the class declares it
     plain_type: Any  # the type in files and flags, without None
     default: Any
     option: Option

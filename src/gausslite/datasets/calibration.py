@@ -53,7 +53,7 @@ class Evidence:
 
     option: str  # name of the option that states it
     value: str  # as the option reads it
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]  # the lines that a user reads
     guaranteed: bool = False  # by the source; False for an estimate
 
     def __str__(self) -> str:

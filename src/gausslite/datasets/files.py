@@ -40,7 +40,7 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+|[-+]?\d*,\d+(?:[eE][-
 class DepthUnits:
     """Units per metre of a depth image."""
 
-    per_metre: float
+    per_metre: float  # 1000 for millimetres
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -269,8 +269,8 @@ class FolderReader:
     """A SourceReader for a class of sequences in folders or files."""
 
     sources: FolderSourceClass
-    layout: str
-    address: str = ""
+    layout: str  # the names of its files, for messages
+    address: str = ""  # what it opens that is no folder, for messages
 
     def recognises(self, address: str) -> bool:
         """True if the path has this layout."""
@@ -323,7 +323,7 @@ class PoseTrack:
     """
 
     location: str
-    times_s: Float64[ndarray, " n"]
+    times_s: Float64[ndarray, " n"]  # ascending
     translations_m: Float64[ndarray, "n 3"]
     quats_xyzw: Float64[ndarray, "n 4"]
     max_gap_s: float

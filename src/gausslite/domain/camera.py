@@ -37,10 +37,10 @@ _MAX_COEFFICIENT = 1e3
 class Camera:
     """Intrinsics in pixels; the image plane's origin is the top-left corner of the top-left pixel."""
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
+    fx_px: float  # focal length in image columns
+    fy_px: float  # focal length in image rows
+    cx_px: float  # column of the principal point; the first pixel's centre is at 0.5
+    cy_px: float  # its row
     width_px: int
     height_px: int
 

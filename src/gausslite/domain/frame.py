@@ -144,8 +144,8 @@ class Frame:
     detectors; None if it never was. Raises ShapeError, PoseError, InvalidInputError.
     """
 
-    index: int
-    capture_time_ns: int
+    index: int  # number in the sequence
+    capture_time_ns: int  # of the sensor's clock
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
     camera: Camera

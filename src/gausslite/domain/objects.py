@@ -46,7 +46,7 @@ class NounMatch:
     """
 
     noun: str
-    basis: MatchBasis
+    basis: MatchBasis  # how the classes were found
     classes: tuple[str, ...] = ()
     similarity: float | None = None
     accepted: bool = True
@@ -96,7 +96,7 @@ class NounReport:
     best_score: float = 0.0  # the highest, in best_frame, below thresholds too; 0 and None without any
     objects: int = 0  # the number of confirmed ones
     rival: str | None = None  # the class that the detections rather show, or None
-    best_frame: int | None = None
+    best_frame: int | None = None  # number of the frame with the best score
 
     def describe(self) -> str:
         """Return one line for the operator: what was found, or why nothing was."""
@@ -136,7 +136,7 @@ class ObjectLandmark:
     InvalidInputError.
     """
 
-    object_id: str
+    object_id: str  # unique in the report, stable while the object is known
     noun: str
     role: ObjectRole
     centroid_m: tuple[float, float, float]  # mean of its observed surface cells
@@ -191,7 +191,7 @@ class Answer:
     """The objects that a question means, and why there may be others. A count is their number."""
 
     objects: tuple[ObjectLandmark, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # why there may be other objects
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +224,7 @@ class ObjectObserver:
 class TeamObject:
     """An object merged from the reports of the agents that observed it."""
 
-    landmark: ObjectLandmark
+    landmark: ObjectLandmark  # merged over the observers
     observers: tuple[ObjectObserver, ...]
 
 

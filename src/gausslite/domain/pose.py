@@ -182,7 +182,7 @@ def pose_at(times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"], time_n
 class Twist:
     """A camera's velocity in its own axes: T_world_camera(t + dt) ≈ T_world_camera(t) · exp(dt · twist)."""
 
-    linear_m_s: Float64[ndarray, "3"]
+    linear_m_s: Float64[ndarray, "3"]  # of the camera's centre
     angular_rad_s: Float64[ndarray, "3"]
 
     @property
@@ -199,7 +199,7 @@ class Twist:
 class Trajectory:
     """Poses at ascending times. Raises ShapeError, InvalidInputError."""
 
-    times_s: Float64[ndarray, " n"]
+    times_s: Float64[ndarray, " n"]  # of the frames' capture
     T_world_camera: Float64[ndarray, "n 4 4"]
 
     def __post_init__(self) -> None:

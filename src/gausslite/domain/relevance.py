@@ -40,7 +40,7 @@ class Region(Protocol):
 class BallRegion:
     """All surface points within radius_m of a world point."""
 
-    centre_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float]  # in the world
     radius_m: float
 
     def __post_init__(self) -> None:
@@ -159,7 +159,7 @@ def _world_points(frame: Frame, window: tuple[slice, slice]) -> Float[ndarray, "
 class Rival:
     """A class of a different thing that a detector finds in the same place, and its score."""
 
-    name: str
+    name: str  # the class that was detected
     score: float
 
 
@@ -170,10 +170,10 @@ class Detection:
     is_weak: the score is below the detector's threshold. It supports an object that other frames found, nothing else.
     """
 
-    phrase: str
+    phrase: str  # the noun that was searched
     score: float
     box_px: tuple[float, float, float, float]
-    mask: Bool[ndarray, "h w"]
+    mask: Bool[ndarray, "h w"]  # the object's pixels
     rival: Rival | None = None  # None without another class
     is_weak: bool = False
     is_exact: bool = False  # the mask is ground truth, not a network's
@@ -185,7 +185,7 @@ class DetectedBox:
 
     phrase: str
     score: float
-    box_px: tuple[float, float, float, float]
+    box_px: tuple[float, float, float, float]  # left, top, right, bottom
     rival: Rival | None = None
     is_weak: bool = False
 
@@ -196,7 +196,7 @@ class DetectedImage:
 
     index: int  # of the frame
     rgb: UInt8[ndarray, "h w 3"]
-    boxes: tuple[DetectedBox, ...]
+    boxes: tuple[DetectedBox, ...]  # what was found, the weak ones too
 
     @classmethod
     def of(cls, frame: Frame, detections: Sequence[Detection]) -> DetectedImage:
@@ -224,7 +224,7 @@ class CameraView:
     frame_index: int
     T_world_camera: Float64[ndarray, "4 4"]
     times_ns: Int64[ndarray, " t"]  # the capture times of the path, oldest first
-    path: Float64[ndarray, "t 4 4"]
+    path: Float64[ndarray, "t 4 4"]  # pose of each mapped frame
     keyframes: Float64[ndarray, "k 4 4"]
     detected: DetectedImage | None = None
 

@@ -106,11 +106,11 @@ class TaskGraph:
     """
 
     task_id: str
-    text: str
+    text: str  # the sentence
     targets: tuple[str, ...]
     anchors: tuple[str, ...]
     relations: tuple[Relation, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what the parser did not understand, for the operator
     roles: tuple[TargetRole, ...] = ()
     attributes: tuple[ObjectAttributes, ...] = ()
     excluded: tuple[str, ...] = ()  # objects to leave out

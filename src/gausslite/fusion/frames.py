@@ -43,8 +43,8 @@ class AlignmentState(StrEnum):
 class Misfit:
     """Mean point-to-plane distance and luminance difference of samples of one map to another, both saturated."""
 
-    distance_m: float
-    colour: float
+    distance_m: float  # to the plane of the nearest surface
+    colour: float  # of the luminance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +87,9 @@ class FrameAlignment:
     order: int  # rank of its first update among the agents
     state: AlignmentState = AlignmentState.UNKNOWN
     segments: tuple[Segment, ...] = ()  # ascending
-    fit: FrameFit | None = None
+    fit: FrameFit | None = None  # the latest one that was compared
     message: str = ""  # why it is corrected, quarantined or about to be
-    declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # T_fused_agent that the agent states
     against: tuple[str, ...] = ()  # the agents that it contradicts
     is_unknown: bool = False  # the agent does not know its frame; its first segment is what the server has found
 

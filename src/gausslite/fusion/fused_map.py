@@ -61,7 +61,7 @@ class StoredRefinement:
 
     batch: VoxelBatch
     voted_keys: Int64[ndarray, " v"]
-    winner_hashes: UInt64[ndarray, " v"]
+    winner_hashes: UInt64[ndarray, " v"]  # of the vote when it was refined
     sources: tuple[str, ...]  # the agents whose keyframes shaped it
 
     def without(self, changed: Int64[ndarray, " c"]) -> StoredRefinement:
@@ -133,7 +133,7 @@ class WonVoxels:
     """Voxels of a layer with their Gaussians, and the keys that each agent wins in the vote."""
 
     batch: VoxelBatch
-    keys_by_winner: Mapping[str, Sequence[int]]
+    keys_by_winner: Mapping[str, Sequence[int]]  # ascending
 
     def of(self, agent_id: str) -> VoxelBatch:
         """Return the voxels that this agent wins."""
@@ -154,7 +154,7 @@ class FusedMapChanges:
 
     revision: int
     won: WonVoxels
-    removed: Int64[ndarray, " e"]
+    removed: Int64[ndarray, " e"]  # voxels that have no winner any more
 
 
 class FusedMapLayers:

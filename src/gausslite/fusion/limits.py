@@ -29,7 +29,7 @@ class MissionConfig:
 
     mission_id: str
     world_frame: str
-    voxel_size_m: float
+    voxel_size_m: float  # edge of the vote's voxels δ
 
     def with_default_names(self) -> MissionConfig:
         """Return the configuration with "mission" and "world" in place of empty names."""
@@ -81,7 +81,7 @@ class Quotas:
     voxels_per_agent: int = option(500_000, "largest number of voxels per agent", key="quota-voxels", low=1)
     gaussians_per_agent: int = option(3_000_000, "largest number of Gaussians per agent", key="quota-gaussians", low=1)
     keyframes_per_agent: int = option(64, "largest number of keyframes per agent", key="quota-keyframes", low=1)
-    keyframe_pixels: int = 1920 * 1080
+    keyframe_pixels: int = 1920 * 1080  # of one image
     keyframe_bytes_per_agent: int = 64 << 20
     kappa_at_join: int = 120_000  # highest kappa of one Gaussian at the agent's first join
     kappa_per_second: int = 200  # its growth since then: at 4 Hz, 8 iterations train it 32 times a second

@@ -52,7 +52,7 @@ class RefineSettings:
     seed: int = 0
     report_every: int = 10
     check_every: int = 50
-    max_prepared_views: int = 96
+    max_prepared_views: int = 96  # views in memory at a time
 
     def __post_init__(self) -> None:
         for name in ("max_gaussians", "report_every", "check_every", "max_prepared_views"):

@@ -109,10 +109,10 @@ class TrafficCounters:
     """Messages of one agent."""
 
     last_seen_ns: int = 0  # time of its latest subset, 0 before the first
-    roi_bytes: int = 0
-    handover_bytes: int = 0
+    roi_bytes: int = 0  # of the region's voxels, while the mission runs
+    handover_bytes: int = 0  # of the rest of the map, after it
     subsets_accepted: int = 0
-    subsets_stale: int = 0
+    subsets_stale: int = 0  # without a voxel that was new
     subsets_rejected: int = 0
 
     def plus(self, newer: TrafficCounters) -> TrafficCounters:
@@ -149,11 +149,11 @@ class AgentContribution:
     """Stored data of one agent, the number of voxels that it wins, its task's targets, its frame and its traffic."""
 
     agent_id: str
-    joined: bool = False
+    joined: bool = False  # a session is open
     voxels: int = 0
     gaussians: int = 0
-    kappa_sum: int = 0
-    won_voxels: int = 0
+    kappa_sum: int = 0  # over its voxels
+    won_voxels: int = 0  # where the vote chose it
     last_update_seq: int = 0
     keyframes: int = 0
     targets: tuple[str, ...] = ()
@@ -166,10 +166,10 @@ class MissionStatus:
     """The figures of a mission and of each agent."""
 
     mission_config: MissionConfig
-    revision: int
+    revision: int  # of the fused map
     fused_gaussians: int
     fused_voxels: int
     keyframes: int
-    refined: bool
+    refined: bool  # a refined map is there
     agents: tuple[AgentContribution, ...]
-    banned_agents: tuple[str, ...] = ()
+    banned_agents: tuple[str, ...] = ()  # may not contribute

@@ -48,7 +48,7 @@ _TileRow = tuple[int, int, EncodedVoxels]
 class PutOutcome:
     """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
 
-    accepted: Int64[ndarray, " a"]
+    accepted: Int64[ndarray, " a"]  # newer than what was stored
     stale: Int64[ndarray, " s"]
 
 
@@ -56,8 +56,8 @@ class PutOutcome:
 class LogChange:
     """What one transaction deletes and writes. The log has it only after `apply`."""
 
-    deleted: list[int] = field(default_factory=list)
-    rows: list[UpdateRow] = field(default_factory=list)
+    deleted: list[int] = field(default_factory=list)  # row numbers
+    rows: list[UpdateRow] = field(default_factory=list)  # to insert
     puts: list[tuple[str, list[_TileRow], dict[int, list[int]]]] = field(default_factory=list)
     """Map, its new rows, and the rows of the tiles that were written anew."""
     outcomes: list[PutOutcome] = field(default_factory=list)

@@ -162,9 +162,9 @@ class PendingUpdate:
     agent_id: str
     message: bytes | EncodedSubset
     future: Future[Any] = field(default_factory=Future)  # has its outcome, or its content where it is only decoded
-    next_voxel: int = 0
+    next_voxel: int = 0  # the first one that is not stored yet
     outcomes: list[PutOutcome] = field(default_factory=list)
-    queued_s: float = field(default_factory=time.monotonic)
+    queued_s: float = field(default_factory=time.monotonic)  # arrival, of the monotonic clock
 
     def __post_init__(self) -> None:
         # a client that disconnects cannot cancel it any more: the message is stored in any case

@@ -45,7 +45,7 @@ class DepthView:
     camera: Camera
     T_camera_world: Float64[ndarray, "4 4"]
     depth_m: Float32[ndarray, "h w"]
-    nearest_m: Float32[ndarray, "h w"]
+    nearest_m: Float32[ndarray, "h w"]  # least depth around a pixel, so that nothing beside a border is seen through
 
     @cached_property
     def farthest_m(self) -> Float32[ndarray, "h w"]:

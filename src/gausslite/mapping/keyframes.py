@@ -181,7 +181,7 @@ class WindowView:
     """A keyframe prepared for training."""
 
     keyframe: Keyframe
-    training_view: TrainingView
+    training_view: TrainingView  # prepared by the rasterizer, whole or masked to the ROI's tiles
     half_view: TrainingView | None  # in half size, for iterations on whole images; None: they use training_view
     T_camera_world: Float64[ndarray, "4 4"]
     roi: Subset  # the 16x16 tiles that touch the ROI or its margin

@@ -55,7 +55,7 @@ class MappedFrame:
 
     index: int
     seeded: int  # Gaussians added by seeding
-    iterations: int
+    iterations: int  # of training
     gaussians: int  # in the map afterwards
     skipped: str | None = None  # why the frame was not mapped, or None
     T_world_camera: Float64[ndarray, "4 4"] | None = None  # the pose that it was mapped with; None if skipped

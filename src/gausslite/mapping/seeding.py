@@ -51,7 +51,7 @@ class RenderedView:
 
     alpha: Float32[ndarray, "h w"]
     depth_m: Float32[ndarray, "h w"]
-    rgb: Float32[ndarray, "h w 3"]
+    rgb: Float32[ndarray, "h w 3"]  # as rendered, in [0, 1]
 
     @classmethod
     def from_rendering(cls, rendering: Rendering) -> RenderedView:
@@ -226,7 +226,7 @@ class SeedingContext:
 class Seeds:
     """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel)."""
 
-    roi: Gaussians
+    roi: Gaussians  # N_ROI
     background: Gaussians
     anchor: int = NO_ANCHOR  # number of the keyframe that they follow when poses are corrected
 

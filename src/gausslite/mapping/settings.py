@@ -143,11 +143,11 @@ class KeyframeSettings:
 class OptimizationSettings:
     """Training with one frame (Sec. III-D): warm-up iterations on full images, then active ones in the ROI."""
 
-    warmup_iterations: int = 2
-    active_iterations: int = 6
+    warmup_iterations: int = 2  # on whole images; they keep the background in place
+    active_iterations: int = 6  # in the region's tiles
     # trained in turn by an active iteration, if their tiles are no more than one image; 1 as the paper
     active_views: int = 8
-    active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
+    active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS  # which Gaussians these render and update
     # Eq. (2), divided by the image's pixels: Adam's steps with small masks stay comparable
     loss: LossWeights = BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES  # learning rates
@@ -209,7 +209,7 @@ class DensitySettings:
     # of one densification: at low resolution, where all gradients are large, it would fill the table
     max_growth: float = 0.05
     prune_every: int = 100  # mapping iterations
-    min_opacity: float = 0.005
+    min_opacity: float = 0.005  # Gaussians below are pruned
 
     def __post_init__(self) -> None:
         for name in ("densify_every", "prune_every"):

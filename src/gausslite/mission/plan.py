@@ -299,7 +299,7 @@ class MappedRun:
 
     run: OpenRun
     result: MissionResult
-    corrupt: CorruptFrames
+    corrupt: CorruptFrames  # frames that could not be read
     gaussians: Gaussians
     save_error: StorageError | None = None  # why it could not be saved
 

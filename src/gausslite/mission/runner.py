@@ -105,8 +105,8 @@ class MissionTotals:
     keyframes_reevaluated: int = 0
     seeded_in_keyframes: int = 0
     roi_share_sum: float = 0.0
-    busy_s: float = 0.0
-    region_seen: bool = False
+    busy_s: float = 0.0  # time of processing
+    region_seen: bool = False  # a frame has shown the task's region
 
     @property
     def skipped(self) -> int:

@@ -53,16 +53,16 @@ class FrameOutcome:
     waits for the next frame.
     """
 
-    index: int
-    iterations: int
-    gaussians: int
-    roi_share: float
+    index: int  # number in the sequence
+    iterations: int  # of training
+    gaussians: int  # in the map afterwards
+    roi_share: float  # of the pixels
     timing: FrameTiming
     skipped: str | None = None  # why the frame was not mapped, else None
     changed_roi: VoxelBatch | None = None
     detection_lag_frames: int | None = None  # age of the detection that finished during this frame
     reevaluation: Reevaluation = field(default_factory=Reevaluation)  # the earlier keyframes evaluated for a new task
-    localisation: LocalisationState = LocalisationState.TRACKED
+    localisation: LocalisationState = LocalisationState.TRACKED  # whether the robot's place was known
     recovered: tuple[FrameOutcome, ...] = ()  # of frames that waited for the robot's place, mapped before this one
 
     @property

@@ -59,7 +59,7 @@ class Observation:
     capture time. votes: which voxels the mask shows inside and outside the object.
     """
 
-    phrase: str
+    phrase: str  # the noun of the task
     centroid_m: Float64[ndarray, "3"]
     radius_m: float
     cells: Int64[ndarray, " k"]
@@ -113,14 +113,14 @@ class Landmark:
     first_seen_ns, last_seen_ns: capture times of its observations.
     """
 
-    phrase: str
+    phrase: str  # the noun of the task
     centroid_m: Float64[ndarray, "3"]
     radius_m: float
     cells: Int64[ndarray, " k"]  # keys of surface cells, with the number of observations of each in counts
     counts: Int64[ndarray, " k"]
-    seen_count: int
+    seen_count: int  # frames that detected it
     missed_count: int  # frames that should have shown the object but did not
-    best_score: float
+    best_score: float  # of all detections
     farthest_m: float  # the largest distance of an observation
     first_seen_ns: int = 0
     last_seen_ns: int = 0

@@ -134,9 +134,9 @@ class LossWeights:
     with any mask. Without it, masked steps have larger gradients, and Adam's steps on whole images hardly count.
     """
 
-    colour: float = 0.8
-    depth: float = 1.0
-    ssim: float = 0.2
+    colour: float = 0.8  # of |Î − I|; the paper states none
+    depth: float = 1.0  # λ_d of the paper
+    ssim: float = 0.2  # λ_s of the paper
     normalise_by_image: bool = False
 
     def __post_init__(self) -> None:
@@ -154,14 +154,14 @@ class AdamSettings:
     min(1, √(decay_after_updates / t)); t stops at MAX_UPDATE_COUNT. The default inf means no decay.
     """
 
-    means: float = 1e-4
+    means: float = 1e-4  # per step, in metres
     log_scales: float = 5e-3
     quats: float = 1e-3
     opacity_logits: float = 5e-2
     rgb: float = 2.5e-3
-    beta1: float = 0.9
-    beta2: float = 0.999
-    epsilon: float = 1e-15
+    beta1: float = 0.9  # decay of the first moment
+    beta2: float = 0.999  # decay of the second moment
+    epsilon: float = 1e-15  # keeps the step finite
     decay_after_updates: float = math.inf
 
     def __post_init__(self) -> None:

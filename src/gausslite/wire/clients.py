@@ -60,7 +60,7 @@ UNKNOWN: Final = "unknown"
 class Export:
     """The map to download: `vote`, `concatenation` or `refined`; with an agent's id only its contribution."""
 
-    strategy: str = "vote"
+    strategy: str = "vote"  # the layer
     agent_id: str = ""
 
 

@@ -193,10 +193,10 @@ class MapUpdate:
 
     revision: int
     snapshot: bool
-    first: bool
+    first: bool  # the first message of its revision
     last: bool
     batch: VoxelBatch | None
-    grid: VoxelGrid | None
+    grid: VoxelGrid | None  # None without voxels
     winners: tuple[str, ...]
 
     def apply_to(self, batch: VoxelBatch) -> VoxelBatch:

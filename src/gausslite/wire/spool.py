@@ -135,7 +135,7 @@ class SpoolBatch:
     newer update of the voxel is pending.
     """
 
-    purpose: Purpose
+    purpose: Purpose  # the region, or the handover
     batch: VoxelBatch
     enqueue_counts: Int64[ndarray, " v"]
 

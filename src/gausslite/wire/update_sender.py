@@ -88,8 +88,8 @@ class UplinkCounters:
     keyframes_sent counts each acknowledged keyframe once; keyframe_bytes has their bytes, resends included.
     """
 
-    roi_bytes: int = 0
-    handover_bytes: int = 0
+    roi_bytes: int = 0  # of the region's voxels, while the mission runs
+    handover_bytes: int = 0  # of the rest, after it
     gaussians_sent: int = 0
     voxels_sent: int = 0
     voxels_waiting: int = 0
@@ -98,7 +98,7 @@ class UplinkCounters:
     keyframe_bytes: int = 0
     subsets_sent: int = 0
     subsets_rejected: int = 0
-    joins: int = 0
+    joins: int = 0  # sessions that were opened
     connected: bool = False
     stopped_because: str = ""  # the error that stopped the uplink, empty while it runs
 
@@ -114,7 +114,7 @@ class SentPart:
 
     batch: SpoolBatch
     request: pb.ContributeSubsetsRequest
-    update_seq: int
+    update_seq: int  # the highest one in the message
 
 
 class UpdateSender:
