@@ -15,8 +15,9 @@ from gausslite.codec.encoded_voxels import to_records
 from gausslite.codec.json import encode_object_report
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import SubsetCoding, encode_subset, unpack_subset
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.pose import Twist
 from gausslite.domain.voxels import (

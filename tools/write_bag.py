@@ -24,8 +24,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gausslite.datasets.files import first_readable_size, read_rows
 from gausslite.datasets.tum import read_tum_camera
-from gausslite.domain.camera import Lens
 from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.lens import Lens
 
 COLOUR_FRAME, WORLD_FRAME = "camera_color_optical_frame", "odom"
 COLOUR = "/camera/color"

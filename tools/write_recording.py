@@ -18,9 +18,10 @@ import numpy as np
 from numpy import ndarray
 from tqdm import tqdm
 
-from gausslite.datasets.folder import format_pose_rows
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Lens, back_project
+from gausslite.datasets.pose_track import format_pose_rows
+from gausslite.domain.camera import back_project
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import transform_of, transform_points
 
 _START_NS = 1_700_000_000_000_000_000

@@ -19,11 +19,12 @@ from gausslite.config.task_parser import DefaultParser
 from gausslite.datasets.calibration import StatedValues, as_recorded_notes, open_calibrator
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.objects import Answer, ObjectLandmark
 from gausslite.domain.pose import Twist, UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import DatasetError
-from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.task_mapper import FrameOutcome
 
 _PERCENTILES = {"p50_ms": 50, "p90_ms": 90, "p99_ms": 99, "max_ms": 100}

@@ -15,11 +15,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
+from gausslite.datasets.calibration import Calibration, FoundValue, StatedValues
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import CameraMotion, Lens
+from gausslite.domain.camera import CameraMotion
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import Twist
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite_calibration.camera_estimate import estimate_camera
@@ -33,7 +34,7 @@ _NONE = "none"
 
 
 def calibrate(
-    source: Source, stated: StatedValues | None = None, report: Callable[[Evidence], None] | None = None
+    source: Source, stated: StatedValues | None = None, report: Callable[[FoundValue], None] | None = None
 ) -> Calibration:
     """Return the source as it should be mapped, and its pose prior. Estimates take ten to thirty seconds.
 
@@ -48,9 +49,9 @@ def calibrate(
         stated = replace(
             stated, correction=correction or CameraCorrection(lens), pose_prior=prior or PoseExposurePrior()
         )
-    found: list[Evidence] = []
+    found: list[FoundValue] = []
 
-    def decide(evidence: Evidence) -> None:
+    def decide(evidence: FoundValue) -> None:
         found.append(evidence)
         if report is not None:
             report(evidence)
@@ -135,33 +136,33 @@ def _contradiction(source: Source, force: bool) -> Contradiction | None:
     raise DatasetError(f"{source.name}: {found}; {advice}, or map it as it is with --set force=true")
 
 
-def _registration_of(source: Source, decide: Callable[[Evidence], None]) -> DepthRegistration | None:
+def _registration_of(source: Source, decide: Callable[[FoundValue], None]) -> DepthRegistration | None:
     if source.depth_registered:
-        decide(Evidence("register-depth", _NONE, ("the layout has registered depth",), guaranteed=True))
+        decide(FoundValue("register-depth", _NONE, ("the layout has registered depth",), guaranteed=True))
         return None
     registration, reason = find_registration(source)
-    decide(Evidence("register-depth", str(registration or _NONE), (reason,)))
+    decide(FoundValue("register-depth", str(registration or _NONE), (reason,)))
     return registration
 
 
-def _correction_of(source: Source, lens: Lens | None, decide: Callable[[Evidence], None]) -> CameraCorrection:
+def _correction_of(source: Source, lens: Lens | None, decide: Callable[[FoundValue], None]) -> CameraCorrection:
     if source.camera_ideal:
-        decide(Evidence("camera-correction", _NONE, ("the source has an ideal camera",), guaranteed=True))
+        decide(FoundValue("camera-correction", _NONE, ("the source has an ideal camera",), guaranteed=True))
         return CameraCorrection()
     if not source.depth_registered:
-        decide(Evidence("camera-correction", _NONE, ("needs depth that is known to be registered to colour",)))
+        decide(FoundValue("camera-correction", _NONE, ("needs depth that is known to be registered to colour",)))
         return CameraCorrection()
     estimate = estimate_camera(source, CameraCorrection(lens or source.lens))
     correction = estimate.correction
     text = _NONE if correction.is_identity else str(correction)
-    decide(Evidence("camera-correction", text, estimate.evidence))
+    decide(FoundValue("camera-correction", text, estimate.evidence))
     return correction
 
 
-def _pose_prior_of(source: Source, decide: Callable[[Evidence], None]) -> PoseExposurePrior:
+def _pose_prior_of(source: Source, decide: Callable[[FoundValue], None]) -> PoseExposurePrior:
     if source.poses_exact:
-        decide(Evidence("pose-prior", _NONE, ("the source has exact poses",), guaranteed=True))
+        decide(FoundValue("pose-prior", _NONE, ("the source has exact poses",), guaranteed=True))
         return PoseExposurePrior()
     prior, reason = estimate_pose_exposure_prior(source)
-    decide(Evidence("pose-prior", _NONE if prior.is_exact else str(prior), (reason,)))
+    decide(FoundValue("pose-prior", _NONE if prior.is_exact else str(prior), (reason,)))
     return prior

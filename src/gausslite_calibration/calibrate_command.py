@@ -9,7 +9,7 @@ from gausslite.cli.progress import progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import to_toml
 from gausslite.config.values import read_correction, read_up_axis
-from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
+from gausslite.datasets.calibration import Calibration, FoundValue, StatedValues
 from gausslite.mission.recording import open_recorded
 from gausslite.mission.results import FileKind, as_text, prepare_file
 from gausslite.process import print_message
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     source = open_recorded(options.source, options.up)
     with progress_bar(_STEPS, "calibrate", "estimate") as bar:
 
-        def count(evidence: Evidence) -> None:
+        def count(evidence: FoundValue) -> None:
             bar.set_postfix_str(evidence.option)
             bar.update()
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy import ndarray
 
 from gausslite.datasets.source import Source, downscaled_size
-from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.corrected import ideal_camera
 from gausslite_calibration.exposure_time import estimate_exposure_time

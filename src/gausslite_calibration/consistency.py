@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
+from gausslite.datasets.pose_track import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.source import Source, downscaled_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError

@@ -18,9 +18,10 @@ from numpy import ndarray
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, WrappedSource
-from gausslite.domain.camera import MAX_READOUT_S, Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import MAX_READOUT_S, Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Trajectory, Twist
 from gausslite.domain.recording import CameraCorrection
 

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Lens, LensModel, back_project
+from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Twist, inverse, transform_of, twist_of
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.corrected import correct_frame, recorded_pixels

@@ -25,10 +25,11 @@ from gausslite.render.choose import choose_rasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1 import region_service_pb2 as region_pb
+from gausslite.wire.call_limits import RejectionLog
 from gausslite.wire.channel import MAX_MESSAGE_BYTES
 from gausslite.wire.convert import digests_from_messages, digests_to_messages
 from gausslite.wire.map_changes import read_deadline
-from gausslite.wire.security import Caller, RejectionLog
+from gausslite.wire.security import Caller
 from gausslite.wire.server import Service
 from gausslite_cluster.peers import READ_S, PartSender, Peers
 from gausslite_cluster.postgres_regions import SharedSlots

@@ -16,7 +16,7 @@ from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option, plain_options
 from gausslite.config.plain_values import Plain
 from gausslite.config.program import Program
-from gausslite.config.values import VOXEL_SIZE, read_text
+from gausslite.config.values import VOXEL_SIZE, not_empty
 from gausslite.datasets.open import default_world_frame
 from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid
@@ -130,7 +130,7 @@ class DemoOptions:
 
     out: Path = option(MISSING, "folder for report.html, report.json, maps and pictures", metavar="DIR")
     source: str | None = option(
-        None, "a sequence to divide between the agents (default: a simulated home)", metavar="SOURCE", convert=read_text
+        None, "a sequence to divide between the agents (default: a simulated home)", metavar="SOURCE", convert=not_empty
     )
     task_a: str = option("Pick up the mug on the table", "task of agent-a")
     task_b: str = option("Identify the chair closest to the table", "task of agent-b")

@@ -19,8 +19,8 @@ from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.values import NONE, read_correction, read_registration_or_auto
 from gausslite.datasets.calibration import StatedValues
-from gausslite.datasets.folder import read_pose_rows
 from gausslite.datasets.open import default_world_frame
+from gausslite.datasets.pose_track import read_pose_rows
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame

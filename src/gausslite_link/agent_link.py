@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Lens
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, UnavailableError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.channel import RetryDelay

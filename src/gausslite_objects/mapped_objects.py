@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.codec.json import object_as_json
 from gausslite.codec.ply import read_ply
 from gausslite.codec.run_files import read_keyframe_views
-from gausslite.datasets.folder import read_pose_rows
+from gausslite.datasets.pose_track import read_pose_rows
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.objects import Answer, ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.pose import UpAxis, upward_axis

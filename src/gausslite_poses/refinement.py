@@ -12,9 +12,10 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, require_rigid, transform_of
 from gausslite.domain.state import State, get_array, get_counts, int_array
-from gausslite.mapping.keyframes import Keyframe, WindowView
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.pose_estimation import RefinementSettings, RenderMap
 from gausslite.mapping.poses import PoseTable
+from gausslite.mapping.window_view import WindowView
 from gausslite_poses.exposure import fit_exposure
 from gausslite_poses.photometric import fit_pose
 

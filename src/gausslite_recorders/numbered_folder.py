@@ -12,7 +12,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.files import load_rgbd
-from gausslite.datasets.folder import FolderSource, Origin, is_lost, nearest_rigid
+from gausslite.datasets.folder import FolderSource, Origin, is_lost
+from gausslite.datasets.pose_track import nearest_rigid
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.files import DepthUnits, RgbdImage, decode_image, require_pixel_count, resize_depth, resize_rgbd
-from gausslite.datasets.folder import FolderReader, FolderSource, estimate_up, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import FolderReader, FolderSource, estimate_up, is_lost
+from gausslite.datasets.pose_track import pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError

@@ -13,7 +13,8 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import example_camera_file, read_folder_camera
 from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
-from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader, is_lost
+from gausslite.datasets.pose_track import pose_from_quaternion
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite_recorders.numbered_folder import NumberedFolderSource

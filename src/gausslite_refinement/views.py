@@ -18,7 +18,7 @@ from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.fusion.refinement import RefineInput
-from gausslite.mapping.keyframes import roi_weights
+from gausslite.mapping.window_view import roi_weights
 from gausslite.render.rasterizer import FULL_FRAME, Rasterizer, Subset, TrainingView
 
 _FOOTPRINT_ALPHA = 0.5

@@ -17,7 +17,7 @@ from numpy import ndarray
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.datasets.camera_files import read_camera_file
 from gausslite.datasets.files import is_number, parse_numbers, read_lines, read_text
-from gausslite.datasets.folder import nearest_rigid, pose_from_quaternion, read_pose_rows
+from gausslite.datasets.pose_track import nearest_rigid, pose_from_quaternion, read_pose_rows
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.pose import inverse

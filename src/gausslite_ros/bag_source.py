@@ -14,7 +14,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera, read_camera_file
-from gausslite.datasets.folder import FIRST_VIEW_UP, Origin, PoseTrack
+from gausslite.datasets.folder import FIRST_VIEW_UP, Origin
+from gausslite.datasets.pose_track import PoseTrack
 from gausslite.datasets.source import (
     Source,
     excluded_frames_note,
@@ -22,9 +23,10 @@ from gausslite.datasets.source import (
     require_matches,
     require_position,
 )
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 from gausslite_ros.bag_file import BagAddress, BagFile, BagOptions, MessageKey, StampedMessage, is_bag_address
 from gausslite_ros.cameras import (

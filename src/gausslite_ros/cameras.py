@@ -13,9 +13,10 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.files import RgbdImage, resize_rgbd
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, MissingPluginError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite_ros.messages import (
     CompressedImageMessage,
     decode_colour,

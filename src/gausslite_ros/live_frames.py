@@ -13,10 +13,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera
-from gausslite.datasets.folder import MAX_POSE_GAP_S
-from gausslite.domain.camera import Lens
+from gausslite.datasets.pose_track import MAX_POSE_GAP_S
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import ClockJumps, Frame
+from gausslite.domain.lens import Lens
 from gausslite_ros.bag_file import BagOptions
 from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose, require_own_camera, same_camera
 from gausslite_ros.messages import TransformMessage, camera_of, frame_name, stamp_ns

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder import quat_xyzw
+from gausslite.datasets.pose_track import quat_xyzw
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite_link.agent_link import AgentSnapshot, SentFrames

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.datasets.folder import pose_from_quaternion
+from gausslite.datasets.pose_track import pose_from_quaternion
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import image_size
 from gausslite.domain.pose import inverse

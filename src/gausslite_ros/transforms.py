@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder import MAX_POSE_GAP_S, PoseTrack
+from gausslite.datasets.pose_track import MAX_POSE_GAP_S, PoseTrack
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import inverse
 from gausslite_ros.messages import TransformMessage, frame_name, quaternion_of, stamp_ns, translation_of

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl
 
-from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.lens import Lens
 
 TRAJECTORY_COUNT = 3
 _SIDES_PX = (16, 4096)

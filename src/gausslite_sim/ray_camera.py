@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.lens import Lens
 
 _NEWTON_STEPS = 20
 _NEWTON_DIFFERENCE = 1e-6

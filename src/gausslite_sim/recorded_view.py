@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import inverse
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.scene import HomeScene

@@ -12,7 +12,7 @@ import numpy as np
 from gausslite.codec.json import object_from_json
 from gausslite.codec.ply import read_ply
 from gausslite.codec.run_files import read_keyframe_views
-from gausslite.datasets.folder import read_pose_rows
+from gausslite.datasets.pose_track import read_pose_rows
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import TRAJECTORY, read_report

@@ -8,7 +8,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import DatasetError
-from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameTiming
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite_bench.frame_costs import loop_figures

@@ -12,7 +12,7 @@ from tool_modules import load_tool
 from tum_recording import write_home
 
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Lens, LensModel
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.camera_estimate import estimate_camera, minimum
 from gausslite_calibration.exposure_time import estimate_exposure_time

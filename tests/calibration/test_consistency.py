@@ -11,12 +11,12 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.calibration import StatedValues, as_recorded_notes
-from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.open import open_source
+from gausslite.datasets.pose_track import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.source import Source, WrappedSource
-from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Trajectory, transform_of
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite_calibration.calibrate import calibrate, contradictions

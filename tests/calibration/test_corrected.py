@@ -11,8 +11,9 @@ import pytest
 from tiny_sequences import write_seven_scenes
 
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera, Lens, LensModel, lift, project
+from gausslite.domain.camera import Camera, lift, project
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Twist, inverse, transform_points
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.corrected import CorrectedSource, correct_frame, ideal_camera

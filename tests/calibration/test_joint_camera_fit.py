@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Lens
+from gausslite.domain.lens import Lens
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.joint_camera_fit import fit_camera
 from gausslite_calibration.moving_pairs import MovingPairs

@@ -11,9 +11,10 @@ import pytest
 from tum_recording import write_home
 
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Twist
 from gausslite.domain.recording import CameraCorrection
 from gausslite.mission.runner import FrameStream

@@ -10,8 +10,8 @@ from agent_running import TASK, Agent, agent
 from exported_recordings import home_frames
 from waiting import wait_until
 
-from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import UnavailableError
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.wire.clients import AgentClient
 from gausslite_link.agent_link import AgentLink, LinkSettings
 

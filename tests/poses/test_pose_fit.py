@@ -14,11 +14,12 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.mapping.keyframes import Keyframe, window_view
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pose_estimation import RefinementSettings
 from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.settings import ONLINE_RATES, KeyframeSettings, MapperSettings, OptimizationSettings
+from gausslite.mapping.window_view import window_view
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rendering

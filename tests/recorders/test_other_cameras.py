@@ -12,8 +12,9 @@ from support.tiny_sequences import write_seven_scenes
 
 from gausslite.datasets.camera_files import read_camera_file, read_folder_camera
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera, Lens, LensModel
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
+from gausslite.domain.lens import Lens, LensModel
 
 SENSOR = (
     "m_colorWidth = 32\nm_colorHeight = 24\nm_depthShift = 5000\n"

@@ -13,7 +13,7 @@ from sample_gaussians import random_gaussians
 from gausslite.cli.main import main
 from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, write_keyframe_views
-from gausslite.datasets.folder import format_pose_rows, quat_xyzw
+from gausslite.datasets.pose_track import format_pose_rows, quat_xyzw
 from gausslite.domain.camera import Camera
 from gausslite.domain.pose import inverse, transform_of
 from gausslite_render.poses import moved, read_transform, read_views

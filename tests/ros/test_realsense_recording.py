@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from robot_bag import load_write_bag
 
-from gausslite.datasets.folder import pose_from_quaternion
 from gausslite.datasets.open import open_source
+from gausslite.datasets.pose_track import pose_from_quaternion
 from gausslite.domain.camera import Camera
 from gausslite_calibration.registered import register_depth
 from gausslite_ros.bag_file import BagFile

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.lens import Lens
 from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.ray_camera import RayCamera, undistorted

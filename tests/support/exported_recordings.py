@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.datasets.folder import format_pose_rows
 from gausslite.datasets.open import open_source
+from gausslite.datasets.pose_track import format_pose_rows
 from gausslite.domain.frame import Frame
 
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

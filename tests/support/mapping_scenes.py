@@ -8,7 +8,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.mapper import FrameView, GaussianMapper, MappedFrame
-from gausslite.mapping.training import CountedScheduler, StageScheduler
+from gausslite.mapping.stages import CountedScheduler, StageScheduler
 from gausslite.render.rasterizer import Rendering
 
 

@@ -11,7 +11,7 @@ from sample_gaussians import plain_gaussians
 
 from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, write_keyframe_views
-from gausslite.datasets.folder import format_pose_rows
+from gausslite.datasets.pose_track import format_pose_rows
 from gausslite.domain.camera import Camera
 from gausslite_view.view_images import ViewImage, write_view_images
 

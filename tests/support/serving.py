@@ -7,7 +7,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from gausslite.wire.security import CallLimits, Tls
+from gausslite.wire.call_limits import CallLimits
+from gausslite.wire.security import Tls
 from gausslite.wire.server import RunningServer, Service, start_server
 
 

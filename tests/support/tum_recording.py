@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gausslite.datasets.folder import format_pose_rows
 from gausslite.datasets.open import open_source
+from gausslite.datasets.pose_track import format_pose_rows
 from gausslite.domain.pose import interpolate_poses
 
 START_NS = 1_700_000_000_123_456_789

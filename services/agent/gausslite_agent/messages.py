@@ -17,7 +17,7 @@ _OUTCOMES = enum_numbers(pb.FrameOutcome, Outcome)
 _LOCALISATIONS = enum_numbers(pb.Localisation, LocalisationState)
 
 
-def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
+def frame_report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
     """Encode the outcome of one frame."""
     return pb.IngestFramesResponse(
         **values_of(report, ("index", "reason", "iterations", "gaussians", "roi_share", "seconds")),

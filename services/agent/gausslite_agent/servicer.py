@@ -51,7 +51,7 @@ from gausslite.wire.views import (
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import (
-    report_to_message,
+    frame_report_to_message,
     status_to_message,
     summary_to_message,
 )
@@ -192,7 +192,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         reader = asyncio.ensure_future(self._read_frames(request_iterator, outcomes))
         try:
             while (outcome := await outcomes.get()) is not None:
-                yield report_to_message(await outcome)
+                yield frame_report_to_message(await outcome)
             await reader
         finally:
             reader.cancel()

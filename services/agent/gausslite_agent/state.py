@@ -17,7 +17,7 @@ from gausslite.domain.objects import NounReport, ObjectLandmark
 from gausslite.domain.pose import PoseCorrection
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_text, int_array
 from gausslite.domain.task import TaskGraph
-from gausslite.mapping.training import SkippableStage
+from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.checkpoint import SavedRun
 from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.task_mapper import FrameOutcome

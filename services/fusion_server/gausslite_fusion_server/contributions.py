@@ -7,7 +7,8 @@ from typing import NamedTuple
 from gausslite.domain.errors import GaussLiteError, MismatchError, SessionUnknownError, StorageError, UnavailableError
 from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.security import Caller, RejectionLog
+from gausslite.wire.call_limits import RejectionLog
+from gausslite.wire.security import Caller
 from gausslite.wire.status import code_and_reason
 
 STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)

@@ -21,9 +21,10 @@ from gausslite.plugins import Group, load
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire import convert
+from gausslite.wire.call_limits import RejectionLog
 from gausslite.wire.convert_task import graph_from_message, object_to_message, report_from_message
 from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
-from gausslite.wire.security import Caller, RejectionLog
+from gausslite.wire.security import Caller
 from gausslite.wire.server import Service
 from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_from_message, view_to_pngs
 from gausslite.wire.worker_pool import WorkerPool

@@ -20,9 +20,10 @@ from gausslite.fusion.refinement import RefineSettings
 from gausslite.plugins import Group, names
 from gausslite.process import print_message
 from gausslite.render.choose import backends
+from gausslite.wire.call_limits import CallLimits
 from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port, require_callable
 from gausslite.wire.run_service import LogFormat
-from gausslite.wire.security import CallLimits, Tls, TlsFiles
+from gausslite.wire.security import Tls, TlsFiles
 
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"

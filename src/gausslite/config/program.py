@@ -147,7 +147,7 @@ class Program:
 
     def _add_flag(self, parser: CommandParser, declared: OptionField) -> None:
         flag = f"--{declared.key}"
-        details = {"help": describe(declared)} if declared.plain_type is bool else _argument(declared)
+        details = {"help": option_help(declared)} if declared.plain_type is bool else _argument(declared)
         if declared.key not in self.flags:
             details["help"] = SUPPRESS  # accepted, but the help shows what changes from run to run
         if declared.plain_type is bool:
@@ -260,7 +260,7 @@ class Program:
         """
         lines = [f"# {program}: effective settings"]
         for key, declared in self.options.items():
-            lines.append(f"\n# {describe(declared)}")
+            lines.append(f"\n# {option_help(declared)}")
             value = _plain_value(declared, given.get(key))
             if value is not None:
                 lines.append(to_toml({key: value}).rstrip("\n"))
@@ -318,7 +318,7 @@ def without_options(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: text for name, text in environment.items() if not name.startswith(PREFIX) or name == _SIMD_VARIABLE}
 
 
-def describe(declared: OptionField, *, with_choices: bool = True) -> str:
+def option_help(declared: OptionField, *, with_choices: bool = True) -> str:
     """Return the help of an option with its choices, its range, what it needs, and its default."""
     option = declared.option
     details = [", ".join(choices_of(declared))] if with_choices else []
@@ -383,7 +383,7 @@ def _argument(declared: OptionField) -> dict[str, Any]:
     """Return the arguments of argparse for an option with a value."""
     placeholder = _placeholder(declared)
     shown = "|".join(choices_of(declared))
-    help_text = describe(declared, with_choices=placeholder != shown)
+    help_text = option_help(declared, with_choices=placeholder != shown)
     return {"metavar": placeholder, "help": help_text.replace("%", "%%")}
 
 

@@ -33,7 +33,7 @@ VOXEL_SIZE: Mapping[str, Any] = {
 """The declaration of an option whose field is a grid."""
 
 
-def read_text(text: str) -> str:
+def not_empty(text: str) -> str:
     """Return the text. Raises InvalidInputError if it is empty."""
     if not text:
         raise InvalidInputError("expected a text, got an empty one")

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import Lens
 from gausslite.domain.errors import MissingPluginError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, load
 
@@ -48,7 +48,7 @@ class StatedValues:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class FoundValue:
     """Why a value that the user did not state was chosen."""
 
     option: str  # name of the option that states it
@@ -69,7 +69,7 @@ class Calibration:
     registration: DepthRegistration | None  # None if depth is used as recorded
     correction: CameraCorrection  # the identity if images are
     pose_prior: PoseExposurePrior
-    evidence: tuple[Evidence, ...] = ()  # of each value that the user did not state
+    evidence: tuple[FoundValue, ...] = ()  # of each value that the user did not state
     notes: tuple[str, ...] = ()  # on poses or depth that contradict the images, and on values that nobody states
 
 
@@ -77,7 +77,7 @@ class Calibrator(Protocol):
     """Decides what neither the user nor the source states; the default of the group `gausslite.calibrators`."""
 
     def calibrate(
-        self, source: Source, stated: StatedValues, report: Callable[[Evidence], None] | None = None, /
+        self, source: Source, stated: StatedValues, report: Callable[[FoundValue], None] | None = None, /
     ) -> Calibration:
         """Return the source as it should be mapped, and its pose prior.
 
@@ -114,7 +114,7 @@ class StatedOnly:
         self._reason = reason
 
     def calibrate(
-        self, source: Source, stated: StatedValues, _report: Callable[[Evidence], None] | None = None
+        self, source: Source, stated: StatedValues, _report: Callable[[FoundValue], None] | None = None
     ) -> Calibration:
         """Return the source as recorded. Raises MissingPluginError for stated values that would change it.
 

@@ -12,8 +12,9 @@ from typing import Protocol, cast
 import numpy as np
 
 from gausslite.datasets.files import parse_numbers, read_rows, read_text
-from gausslite.domain.camera import Camera, FileIntrinsics, Lens, LensModel
+from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.plugins import Group, installed
 
 INTRINSICS_FILE = "camera-intrinsics.txt"

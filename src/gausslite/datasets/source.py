@@ -11,9 +11,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import Trajectory, UpAxis
 from gausslite.domain.relevance import Region
 

@@ -22,24 +22,18 @@ from gausslite.datasets.files import (
     read_rows,
     require_points,
 )
-from gausslite.datasets.folder import (
-    FIRST_VIEW_UP,
-    MAX_POSE_GAP_S,
-    FolderSource,
-    Origin,
-    PoseTrack,
-    is_lost,
-    pose_from_quaternion,
-)
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, Origin, is_lost
+from gausslite.datasets.pose_track import MAX_POSE_GAP_S, PoseTrack, pose_from_quaternion
 from gausslite.datasets.source import (
     excluded_frames_note,
     repeated_times_note,
     require_matches,
     require_position,
 )
-from gausslite.domain.camera import FileIntrinsics, Lens, LensModel
+from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 
 _UNITS = DepthUnits(per_metre=5000.0)

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import MAX_EXPOSURE_S, MAX_READOUT_S, Camera, FileIntrinsics, Lens
+from gausslite.domain.camera import MAX_EXPOSURE_S, MAX_READOUT_S, Camera, FileIntrinsics
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import transform_of
 
 _MAX_TIME_OFFSET_S = 1.0

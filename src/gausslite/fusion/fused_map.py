@@ -213,6 +213,7 @@ class FusedMapLayers:
                 try:
                     changed[agent_id] = self._votes.move(agent_id, keys)
                 except GaussLiteError as error:
+                    # one damaged map must not stop the team
                     failed[agent_id], changed[agent_id] = error, self._votes.leave_out(agent_id, keys)
             self._record(changed)
         return failed

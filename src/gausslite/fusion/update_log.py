@@ -107,6 +107,7 @@ class UpdateLog:
             newer = newer_voxels(self.index, update, lambda name, keys: self._stored(name, keys, read))
             keys = update.voxels.keys
             change.outcomes.append(PutOutcome(keys[newer], keys[~newer]))
+            # a repeated or late message changes nothing
             accepted = update.voxels if newer.all() else update.voxels.take(np.flatnonzero(newer))
             if len(accepted):
                 self._add(change, update.agent_id, accepted, read)
@@ -146,7 +147,7 @@ class UpdateLog:
     def _add(self, change: LogChange, name: str, accepted: EncodedVoxels, read: ReadRows) -> None:
         """Add a row for each tile of these voxels, with all others of the map's tile if that is outdated."""
         label, rows = self.epochs.label_of(name), list[_TileRow]()
-        at_most = _SPARE_UNITS + _REWRITTEN * _size(accepted)
+        at_most = _SPARE_UNITS + _REWRITTEN * _size(accepted)  # work bounded by the message, not by the map
         outdated = self.index.outdated_rows(name, np.unique(tiles_of(accepted.keys)), _SPARE_UNITS, at_most)
         parts = {accepted.size_m: [accepted]}
         for others in self._others(name, accepted.keys, list(itertools.chain(*outdated.values())), read):

@@ -59,8 +59,8 @@ def rank_voxels(table: VoxelScoreTable) -> VoteResult:
     """Rank the agents on each voxel by (higher Σkappa, more Gaussians, lower agent id)."""
     keys, kappa_sums, counts = (table.scores[name] for name in ("keys", "kappa_sums", "counts"))
     # the bitwise complement of an unsigned number sorts it in descending order
-    order = np.lexsort((table.agent_index, ~counts, ~kappa_sums, keys))
-    ranked = table.take(order[counts[order] > 0])
+    order = np.lexsort((table.agent_index, ~counts, ~kappa_sums, keys))  # Σκ, then the denser source, then the first id
+    ranked = table.take(order[counts[order] > 0])  # a tombstone wins nothing
     starts = np.unique(ranked.scores["keys"], return_index=True)[1]
     return VoteResult(ranked, np.append(starts, len(ranked)).astype(np.int64))
 
@@ -71,7 +71,7 @@ def fuse(batch_by_agent: Mapping[str, VoxelBatch]) -> FusedMap:
     vote = rank_voxels(table)
     winners = vote.winners.scores
     keys, sums, counts = (np.ascontiguousarray(winners[name]) for name in ("keys", "kappa_sums", "counts"))
-    won = gaussians.take(gather_rows(starts[winners["rows"]], counts))
+    won = gaussians.take(gather_rows(starts[winners["rows"]], counts))  # a voxel is of one agent alone, never mixed
     return FusedMap(VoxelBatch(keys, sums, counts, won), vote)
 
 

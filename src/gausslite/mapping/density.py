@@ -38,12 +38,12 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
     max_added = min(table.free_slots, math.ceil(settings.max_growth * table.count))
     chosen = _largest_above(_mean_gradient(table), settings.min_mean_gradient, max_added)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
-    small = largest_scale_m <= settings.percent_dense * extent_m
+    small = largest_scale_m <= settings.percent_dense * extent_m  # 3DGS: small ones lack neighbours, large ones detail
     to_clone, to_split = chosen[small], chosen[~small]
     _split(table, to_split)
     _clone(table, to_clone)
     for statistic in (GRAD_2D_SUM, GRAD_2D_COUNT):
-        table.first_moment[:, statistic] = 0.0
+        table.first_moment[:, statistic] = 0.0  # the gradients of before say nothing of the children
     return DensityChange(cloned=len(to_clone), split=len(to_split))
 
 

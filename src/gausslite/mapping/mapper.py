@@ -29,7 +29,8 @@ from gausslite.domain.state import (
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows, rows_moved_away
-from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
+from gausslite.mapping.keyframe_store import KeyframeStore
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.moving import MOTION_REFERENCES, moving_pixels, without_pixels
 from gausslite.mapping.pose_corrector import PoseCorrector
 from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
@@ -37,9 +38,11 @@ from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
+from gausslite.mapping.stages import SkippableStage, Stage, StageScheduler
 from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_roi_evidence
-from gausslite.mapping.training import SkippableStage, Stage, StageScheduler, Trainer
+from gausslite.mapping.training import Trainer
 from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
+from gausslite.mapping.window_view import WindowView, window_view
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 _MAX_KEYFRAMES = 2**31 - 1
@@ -186,7 +189,7 @@ class GaussianMapper:
 
         The map, kappa and the optimiser state stay; the old ROI is evicted first if the cap is reached.
         """
-        clear_roi(self.table)
+        clear_roi(self.table)  # kappa stays: trained voxels keep their weight in the vote
         self.store.reset_roi()
         self._trainer.reset_roi()
 
@@ -205,6 +208,7 @@ class GaussianMapper:
         require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
         table, evaluated = self.table, keyframe.with_relevance(relevance)
         self.store.replace_relevance(evaluated, self._window_view)
+        # earlier Gaussians first: seeds fill only the rest
         update_roi_evidence(table, evaluated.frame, evaluated.relevance)
         if not evaluated.relevance.roi.any():
             return 0
@@ -218,7 +222,7 @@ class GaussianMapper:
         """
         require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
         completed = keyframe.with_relevance(relevance)
-        added = completed.relevance.without(keyframe.relevance.roi)
+        added = completed.relevance.without(keyframe.relevance.roi)  # what it showed before has given its evidence
         if not added.roi.any():
             self.store.replace(completed, None)
             return 0
@@ -332,6 +336,7 @@ class GaussianMapper:
             moved = moving_pixels(frames[chosen], later)
             if moved.any():
                 contradicting = [*frames[:chosen], *later]
+                # they show where the thing was
                 self.table.remove(rows_moved_away(self.table.means_m, frames[chosen], moved, contradicting))
                 rendered = self.render(frames[chosen].camera, frames[chosen].T_world_camera, frames[chosen].motion)
                 self.store.replace(keyframes[chosen].hide(moved, rendered.rgb), self._window_view)
@@ -352,7 +357,7 @@ class GaussianMapper:
             motions = self.corrector.add(keyframe, prior, self.store.kept if search else (), self.table)
             if motions is None:
                 return None
-            move_with_anchors(self.table, motions)
+            move_with_anchors(self.table, motions)  # map, keyframes and poses move together
             self.store.move(motions)
             self.poses.move(motions)
             return motions

@@ -13,8 +13,9 @@ from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State
-from gausslite.mapping.keyframes import Keyframe, WindowView
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
+from gausslite.mapping.window_view import WindowView
 from gausslite.plugins import Group, load
 from gausslite.render.rasterizer import Rendering
 

@@ -1,27 +1,25 @@
-"""Seed new Gaussians from pixels of a frame, by relevance to the task (Sec. III-C: its budget, scales, gradients).
-
-The spacing s0 (Sec. III-C.2) is the median distance of a seed to its three nearest neighbours, which is the distance to
-the second nearest. With λ seeds per pixel it is 0.73 / sqrt(λ) pixels for a Poisson process (π λ r² = 1.678). For one
-seed per grid cell it is 0.89 / sqrt(λ), by measurement. λ is counted over 48x48 pixels around a seed. Only pixels from
-which seeds are drawn count, so that seeds in a narrow gap do not appear sparse. A pixel covers depth / focal length
-metres of a fronto-parallel surface. On slanted surfaces the true spacing is larger, so seeds start slightly smaller
-there.
-"""
+"""Seed new Gaussians from pixels of a frame, by relevance to the task (Sec. III-C: its budget, scales, gradients)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, lift, project
+from gausslite.domain.camera import lift, project
 from gausslite.domain.frame import Frame, with_filled_depth
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.pixel_sampling import (
+    edge_magnitude,
+    initial_spacing_m,
+    neighbour_distance_px,
+    sample_pixels,
+    sample_stratified,
+)
 from gausslite.mapping.settings import Components, SeedingSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.render.rasterizer import NEAR_M, Rendering
@@ -34,11 +32,6 @@ _RESERVED_VIEWS = 4.0
 """Background seeds leave free slots for this many more images."""
 _EDGE_EPSILON = 0.01
 """ε of GFD (Sec. III-C.3)."""
-_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
-_BLOCK_PX = 16
-_MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
-_MEDIAN_STRATIFIED = 0.89
-_MIN_SQUARED_M = 1e-7
 _REFERENCE_PIXELS = 640 * 480
 """Image size of the seed counts in SeedingSettings."""
 _MIN_ROI_ROOM = 0.05
@@ -67,7 +60,8 @@ def rendered_behind(frame: Frame, rendered: RenderedView, depth_error_factor: fl
     comparable = (frame.depth_m > 0) & (rendered.depth_m > 0)
     behind_m = rendered.depth_m - frame.depth_m
     sample = (slice(None, None, _MEDIAN_STEP_PX), slice(None, None, _MEDIAN_STEP_PX))
-    errors_m = np.abs(behind_m[sample][comparable[sample]])
+    errors_m = np.abs(behind_m[sample][comparable[sample]])  # a sample: the median needs no more
+    # the median: what the map really lacks does not raise the limit
     median_m = float(np.median(errors_m)) if len(errors_m) else 0.0
     result: Bool[ndarray, "h w"] = comparable & (behind_m > depth_error_factor * median_m)
     return result
@@ -85,7 +79,7 @@ def undersampled_roi(
     height, width = roi.shape
     shape = (-(-height // _CELL_PX), -(-width // _CELL_PX))
     rows, columns = np.nonzero(roi & (frame.depth_m > 0))
-    min_count = _count_per_cell(rows, columns, shape) / pixels_per_gaussian
+    min_count = _count_per_cell(rows, columns, shape) / pixels_per_gaussian  # what a dense region would have here
     _, active_rows, active_columns = visible_means(frame, active_means_m)
     count = _count_per_cell(active_rows, active_columns, shape)
     sparse = np.repeat(np.repeat(count < min_count, _CELL_PX, axis=0), _CELL_PX, axis=1)[:height, :width]
@@ -98,7 +92,7 @@ def visible_means(
 ) -> tuple[Int64[ndarray, " s"], Int64[ndarray, " s"], Int64[ndarray, " s"]]:
     """Return ids (ascending), pixel rows and pixel columns of the means that lie on the frame's visible surface."""
     points = transform_points(inverse(frame.T_world_camera), means_m)
-    ids = np.flatnonzero(points[:, 2] > NEAR_M)
+    ids = np.flatnonzero(points[:, 2] > NEAR_M)  # what lies behind the camera has no pixel
     points = points.take(ids, axis=0)
     if frame.motion is not None:
         points = frame.motion.at_exposure(points.astype(np.float64), frame.camera).astype(np.float32)
@@ -108,6 +102,7 @@ def visible_means(
     ids, z_m = ids[inside], points[inside, 2]
     rows, columns = y_px[inside].astype(np.int64), x_px[inside].astype(np.int64)
     depth_m = frame.depth_m[rows, columns]
+    # others are occluded, or float in front of the surface
     on_surface = np.abs(z_m - depth_m) < _MAX_RELATIVE_DEPTH_ERROR * depth_m
     return ids[on_surface], rows[on_surface], columns[on_surface]
 
@@ -115,101 +110,6 @@ def visible_means(
 def _count_per_cell(rows: ndarray, columns: ndarray, shape: tuple[int, int]) -> ndarray:
     cells = (rows // _CELL_PX) * shape[1] + columns // _CELL_PX
     return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
-
-
-def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
-    """Return E(u, v) = ‖∇I(u, v)‖, the Sobel gradient magnitude of the luminance in [0, 1] (Sec. III-C.3)."""
-    luminance = rgb @ _LUMINANCE
-    # the Sobel kernel returns 8 times the derivative
-    dx = cv2.Sobel(luminance, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
-    dy = cv2.Sobel(luminance, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
-    return np.asarray(cv2.magnitude(dx, dy))
-
-
-def sample_pixels(
-    pool: Bool[ndarray, "h w"], count: int, pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
-) -> Int64[ndarray, " n"]:
-    """Return up to `count` pixels of the pool (flat indices, ascending), drawn by weight without replacement."""
-    pixels = np.flatnonzero(pool)
-    if len(pixels) <= count:
-        return pixels
-    arrival = _arrival_times(pixels, pixel_weights, rng)
-    return np.sort(pixels[np.argpartition(arrival, count)[:count]]) if count > 0 else pixels[:0]
-
-
-def sample_stratified(
-    pool: Bool[ndarray, "h w"], count: int, pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
-) -> Int64[ndarray, " n"]:
-    """Return up to `count` pixels of the pool (flat indices, ascending), at most one per cell of a square grid.
-
-    If the pool is the whole image, the grid has √count x √count cells (Sec. III-C.2). For a smaller pool the cells are
-    smaller, so that about `count` of them contain pool pixels. Within a cell, the pixel is drawn by weight.
-    """
-    pixels = np.flatnonzero(pool)
-    if len(pixels) <= count:
-        return pixels
-    if count == 0:
-        return pixels[:0]
-    height, width = pool.shape
-    side = int(np.ceil(np.sqrt(count * pool.size / len(pixels))))
-    rows, columns = np.divmod(pixels, width)
-    cells = (rows * side // height) * side + columns * side // width
-    arrival = _arrival_times(pixels, pixel_weights, rng)
-    first_in_cell = np.full(side * side, -1, np.int64)
-    # NumPy keeps the last assignment to a cell: the pixel of the earliest arrival
-    latest_first = np.argsort(-arrival, kind="stable")
-    first_in_cell[cells[latest_first]] = pixels[latest_first]
-    chosen = first_in_cell[first_in_cell >= 0]
-    if len(chosen) > count:
-        chosen = rng.choice(chosen, count, replace=False)
-    return np.sort(chosen)
-
-
-def _arrival_times(
-    pixels: Int64[ndarray, " n"], pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
-) -> Float32[ndarray, " n"]:
-    """Return exponential arrival times with the rates `pixel_weights`.
-
-    The earliest arrivals are a sample by weight without replacement.
-    """
-    arrival: Float32[ndarray, " n"] = rng.standard_exponential(len(pixels), np.float32) / pixel_weights.ravel()[pixels]
-    return arrival
-
-
-def neighbour_distance_px(
-    pixels: Int64[ndarray, " n"], pool: Bool[ndarray, "h w"], stratified: bool
-) -> Float32[ndarray, " n"]:
-    """Return the median distance of each seed to its three nearest neighbours in pixels, at least 1.
-
-    pixels: flat indices of seeds drawn from `pool`. stratified: True if they were drawn one per grid cell.
-    """
-    width = pool.shape[1]
-    seeds = np.zeros(pool.shape, np.bool_)
-    seeds.ravel()[pixels] = True
-    density = _count_around(seeds) / np.maximum(_count_around(pool), 1.0)
-    rows, columns = np.divmod(pixels, width)
-    local = density[rows // _BLOCK_PX, columns // _BLOCK_PX]
-    factor = _MEDIAN_STRATIFIED if stratified else _MEDIAN_POISSON
-    distance: Float32[ndarray, " n"] = np.maximum(factor / np.sqrt(local), 1.0).astype(np.float32)
-    return distance
-
-
-def initial_spacing_m(
-    distance_px: Float32[ndarray, " n"], depth_m: Float32[ndarray, " n"], camera: Camera
-) -> Float32[ndarray, " n"]:
-    """Return s0 in metres at each seed's depth; its square is at least 1e-7."""
-    squared = np.square(camera.length_m(distance_px, depth_m))
-    spacing: Float32[ndarray, " n"] = np.sqrt(np.maximum(squared, np.float32(_MIN_SQUARED_M)))
-    return spacing
-
-
-def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
-    """Return the number of mask pixels in each 16x16 block and its eight neighbours."""
-    height, width = mask.shape
-    padded = np.pad(mask, ((0, -height % _BLOCK_PX), (0, -width % _BLOCK_PX)))
-    by_rows = padded.reshape(-1, _BLOCK_PX, padded.shape[1]).sum(axis=1, dtype=np.uint16)
-    blocks = by_rows.reshape(len(by_rows), -1, _BLOCK_PX).sum(axis=2, dtype=np.uint16).astype(np.float32)
-    return np.asarray(cv2.boxFilter(blocks, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,7 +187,7 @@ class Seeder:
         settings = self._settings
         budget = self._budget(frame, context)
         seedable = (surface.depth_m > 0) & (surface.depth_m <= settings.max_depth_m)
-        roi_candidates = candidates = seedable
+        roi_candidates = candidates = seedable  # an empty map explains nothing
         if context.rendered is not None:
             behind = rendered_behind(frame, context.rendered, settings.depth_error_factor)
             candidates = seedable & (behind | (context.rendered.alpha < settings.min_alpha))
@@ -295,11 +195,11 @@ class Seeder:
         if not self._components.sb:
             no_roi = _Pool(np.zeros_like(seedable), 0, stratified=False)
             return no_roi, self._background_pool(candidates, budget, context.free_slots)
-        roi_budget = int(settings.roi_share * budget)
+        roi_budget = int(settings.roi_share * budget)  # floor(ρN): an upper limit, the rest is not handed on
         spacing = self._roi_pixels_per_gaussian(context)
         if settings.fill_sparse_roi:
             sparse = undersampled_roi(frame, relevance.roi, context.active_means_m, spacing)
-            roi_candidates = roi_candidates | (sparse & seedable)
+            roi_candidates = roi_candidates | (sparse & seedable)  # explained, but by too few Gaussians for detail
         roi_pool = self._roi_pool(relevance.roi & roi_candidates, roi_budget, spacing)
         background_budget = budget - roi_budget
         return roi_pool, self._background_pool(candidates & ~relevance.roi, background_budget, context.free_slots)
@@ -350,7 +250,7 @@ class Seeder:
         if len(pixels) == 0:
             return Gaussians.empty()
         distance_px = neighbour_distance_px(pixels, pool.pixels, pool.stratified)
-        spacing_m = initial_spacing_m(distance_px, frame.depth_m.ravel()[pixels], frame.camera)
+        spacing_m = initial_spacing_m(distance_px, frame.depth_m.ravel()[pixels], frame.camera)  # s0 of Eq. (1)
         return self._init_gaussians(frame, relevance, pixels, spacing_m)
 
     def _init_gaussians(
@@ -364,11 +264,13 @@ class Seeder:
         active = relevance.roi.ravel()[pixels]
         scale_m = spacing_m * np.float32(settings.init_scale)
         if self._components.sis:
+            # Eq. (1): a few iterations cannot shrink a large Gaussian, and large ones bleed into the region
             scale_m = spacing_m * np.where(active, settings.roi_scale, settings.background_scale).astype(np.float32)
         rows, columns = np.divmod(pixels, frame.camera.width_px)
         depths_m = frame.depth_m[rows, columns].astype(np.float64)
         points = lift(np.stack([columns, rows], axis=1) + 0.5, depths_m, frame.camera)
         if frame.motion is not None:
+            # each row saw the world from a pose of its own
             points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
         return Gaussians(
             means_m=transform_points(frame.T_world_camera, points).astype(np.float32),
@@ -377,7 +279,7 @@ class Seeder:
             opacities=np.full(count, settings.opacity, np.float32),
             rgb=frame.rgb.reshape(-1, 3)[pixels].astype(np.float32) / np.float32(255.0),
             active=active,
-            kappa=np.zeros(count, np.uint32),
+            kappa=np.zeros(count, np.uint32),  # nothing has trained it yet
             target=relevance.target.ravel()[pixels],
         )
 
@@ -392,6 +294,7 @@ def insert_seeds(
     does not fill the map. Background seeds evict only inactive Gaussians less opaque than seed_opacity. Seeds beyond
     the remaining capacity are dropped at random. Seeds reuse the evicted rows, so that few rows move.
     """
+    # the task comes first: its seeds make room for themselves
     evicted = _evict_for_roi(table, len(seeds.roi) - table.free_slots, min_background)
     roi = seeds.roi.take(_random_subset(len(seeds.roi), table.free_slots + len(evicted), rng))
     _write(table, roi, evicted, seeds.anchor)
@@ -428,6 +331,7 @@ def _evict_for_background(table: SplatTable, count: int, max_opacity: float) -> 
 def _least_opaque_inactive(table: SplatTable, count: int, candidates: Bool[ndarray, " n"]) -> Int64[ndarray, " k"]:
     """Return up to `count` candidates, the least opaque; those active in an earlier task (kappa > 0) come first."""
     was_active = table.kappa > 0
+    # a finished task has sent them to the team
     earlier_roi = table.most_transparent(np.flatnonzero(candidates & was_active), count)
     others = table.most_transparent(np.flatnonzero(candidates & ~was_active), count - len(earlier_roi))
     return np.concatenate([earlier_roi, others])

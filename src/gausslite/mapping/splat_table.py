@@ -22,8 +22,8 @@ from gausslite.render.rasterizer import (
     ROW_WIDTH,
     UPDATE_COUNT,
     allocate_rows,
-    decode_opacities,
     gaussians_to_rows,
+    row_opacities,
     rows_to_gaussians,
 )
 
@@ -172,7 +172,7 @@ class SplatTable:
     @property
     def opacities(self) -> Float32[ndarray, " n"]:
         """Opacities in (0, 1)."""
-        return decode_opacities(self.rows)
+        return row_opacities(self.rows)
 
     def has_lower_opacity(self, opacity: float) -> Bool[ndarray, " n"]:
         """Return True for each Gaussian whose opacity is lower than this value in (0, 1)."""

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from enum import StrEnum
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt32
@@ -23,10 +21,11 @@ from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import FrameId
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.density import densify, prune
-from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings, SaturationSettings
 from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.mapping.view_rotation import ViewRotation
+from gausslite.mapping.window_view import WindowView
 from gausslite.render.rasterizer import AdamSettings, Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
@@ -64,14 +63,14 @@ class RegionSaturation:
     def released_share(self) -> float:
         """Share of the active iterations to run on whole images instead, in [0, max_released]."""
         settings = self._settings
-        if self._visits < _HORIZON_VISITS:
+        if self._visits < _HORIZON_VISITS:  # a mean of few visits would release too early
             return 0.0
         share = (settings.improving - self._improvement) / (settings.improving - settings.saturated)
         return min(max(share, 0.0), 1.0) * settings.max_released
 
     def observe(self, frame: FrameId, loss: float) -> None:
         """Compare the loss of an active iteration with the previous one on the view of this frame."""
-        if not 0.0 < loss < math.inf:
+        if not 0.0 < loss < math.inf:  # a view without measured pixels says nothing
             return
         view = frame.number
         previous = self._last_loss.pop(view, None)
@@ -85,7 +84,7 @@ class RegionSaturation:
 
     def releases_next(self) -> bool:
         """True if the next active iteration is released. Call it once per active iteration; shares add up exactly."""
-        self._credit += self.released_share
+        self._credit += self.released_share  # a sum in place of a random draw: shares add up exactly
         released = self._credit >= 1.0
         self._credit -= float(released)
         return released
@@ -108,96 +107,6 @@ class RegionSaturation:
         self._last_loss = dict(zip(views.tolist(), losses, strict=True))
         self._improvement, self._credit = get_floats(state, "mean", 2)
         [self._visits] = get_counts(state, "visits", 1)
-
-
-class Stage(StrEnum):
-    """One measured part of processing a frame, in the order of the loop."""
-
-    TRACKING = "tracking"
-    """Find the camera's pose by aligning the frame to the map."""
-    RENDERING = "rendering"
-    """Render the map from the frame's pose."""
-    RELEVANCE = "relevance"
-    """Detect, track and decide which pixels are relevant to the task."""
-    REEVALUATION = "reevaluation"
-    """Evaluate earlier keyframes for a new task."""
-    KEYFRAME_REFINEMENT = "keyframe_refinement"
-    """Refine the pose and exposure of an earlier keyframe."""
-    VIEW_PREPARATION = "view_preparation"
-    """Refine the frame's pose and exposure and prepare the frame for training."""
-    SEEDING = "seeding"
-    WARM_UP = "warm_up"
-    """Iterations over full images."""
-    ACTIVE = "active"
-    """Iterations over the task's region."""
-    PRUNING = "pruning"
-    DENSIFICATION = "densification"
-    FINALISATION = "finalisation"
-    """Clamp colours and update the EMA after the iterations."""
-    LOOP_CLOSURE = "loop_closure"
-    """Find a loop of a keyframe, and correct poses and map."""
-    PUBLISHING = "publishing"
-    """Find the changed voxels of the region and pass them to the uplink."""
-
-
-class SkippableStage(StrEnum):
-    """A part of processing that a frame may skip if its time is short."""
-
-    PUBLISHING = "publishing"
-    """The next frame publishes the changes of this one too, because updates state totals."""
-    SEEDING = "seeding"
-    """The frame neither renders the map first nor adds Gaussians; it only trains."""
-
-
-ITERATION_STAGES = frozenset((Stage.WARM_UP, Stage.ACTIVE))
-
-
-@runtime_checkable
-class StageScheduler(Protocol):
-    """Decides which stages of a frame run and for how many iterations."""
-
-    def timing(self, stage: Stage) -> AbstractContextManager[None]:
-        """Return a context that surrounds one execution of the stage."""
-        ...
-
-    def skips(self, stage: SkippableStage) -> bool:
-        """Return True if the current frame skips this stage."""
-        ...
-
-    def has_time_for(self, stage: Stage) -> bool:
-        """Return True if the frame is expected to meet its deadline with this optional stage."""
-        ...
-
-    def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
-        """Return True if another iteration of this stage should run."""
-        ...
-
-
-class CountedScheduler:
-    """A StageScheduler for one frame without a deadline: nothing is skipped and iterations are counted."""
-
-    def __init__(self) -> None:
-        self._iterations = 0
-
-    def timing(self, stage: Stage) -> AbstractContextManager[None]:
-        """Count the stage if it is an iteration."""
-        self._iterations += stage in ITERATION_STAGES
-        return nullcontext()
-
-    def skips(self, stage: SkippableStage) -> bool:
-        """Return False."""
-        del stage
-        return False
-
-    def has_time_for(self, stage: Stage) -> bool:
-        """Return True."""
-        del stage
-        return True
-
-    def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
-        """Return True until the number of iterations is reached."""
-        del stage
-        return self._iterations < iterations_per_frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -311,6 +220,7 @@ class Trainer:
         """
         views_of = {Stage.WARM_UP: list(views)}
         if self._settings.components.roi and self._settings.optimization.active_iterations > 0:
+            # others would give the region no gradient
             views_of[Stage.ACTIVE] = [view for view in views if view.shows_roi]
         if self._settings.keyframes.rotates:
             return {stage: self._rotations[stage].turns(chosen) for stage, chosen in views_of.items() if chosen}
@@ -321,8 +231,9 @@ class Trainer:
         """Return the stage of the next iteration, after `done` ones; None ends the frame."""
         optimization = self._settings.optimization
         per_frame = optimization.iterations
+        # whole images first: they keep the background in place
         warm_up = not roi_in_view or done % per_frame < optimization.warmup_iterations
-        warm_up = warm_up or self._saturation.releases_next()
+        warm_up = warm_up or self._saturation.releases_next()  # what no longer helps the region helps the rest
         if warm_up and roi_in_view and done > 0:
             # if there is time for neither, the one that is due runs: active iterations may cost as much
             warm_up = scheduler.has_time_for(Stage.WARM_UP) or not scheduler.has_time_for(Stage.ACTIVE)
@@ -357,7 +268,7 @@ class Trainer:
                 view = next(turns)
                 self._train_roi(binding, view)
                 images += view.roi_share
-                if images + view.roi_share > 1.0:
+                if images + view.roi_share > 1.0:  # no more tiles than one image: an iteration has one cost
                     break
         self._iterations += 1
         self._since_prune += 1
@@ -387,7 +298,7 @@ class Trainer:
             masked=True,
             subset=view.roi if binding.active_ids is None else Subset(view.roi.tiles, binding.active_ids),
             trainable=binding.trainable,
-            update_counter=binding.kappa_counter,
+            update_counter=binding.kappa_counter,  # κ: only here, in the active phase
         )
         if self._saturation.enabled:
             self._saturation.observe(view.keyframe.frame.id, report.loss)

@@ -12,7 +12,7 @@ import numpy as np
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.state import State, get_array
-from gausslite.mapping.keyframes import WindowView
+from gausslite.mapping.window_view import WindowView
 
 _MAX_VIEWS = 256
 """Views whose last visit is kept, those visited last."""
@@ -28,6 +28,7 @@ class ViewRotation:
         """Yield these views, which are given oldest first, in turn and without end; each counts as visited."""
         ids = [view.keyframe.frame.id.number for view in views]
         last_visit = {view: place for place, view in enumerate(self._visited)}
+        # never visited: -1, so they come first; of these, the newest needs training most
         order = sorted(range(len(views)), key=lambda i: (last_visit.get(ids[i], -1), -i))
         while order:
             for i in order:

@@ -35,7 +35,7 @@ class SentVoxelTracker:
         active = gaussians if gaussians.active.all() else gaussians.take(gaussians.active)
         voxels = VoxelIndex.from_points(active.means_m, self._grid)
         signatures = VoxelSignatures.from_gaussians(active, voxels)
-        selected = self._may_replace(signatures)
+        selected = self._may_replace(signatures)  # the server keeps what an earlier task trained better
         current = signatures.select(selected)
         changed = np.zeros(len(signatures.keys), np.bool_)
         changed[selected], removed = self._tracker.update(current, retained=self._frozen)
@@ -114,11 +114,12 @@ def insert_team_voxels(table: SplatTable, received: VoxelBatch, grid: VoxelGrid)
     local_sums, local_counts = (
         _lookup(local.keys, values, received.keys) for values in (local.sums(table.kappa), local.counts)
     )
+    # the vote of Sec. III-E, between this robot and the team
     wins = (received.counts > 0) & (received.kappa_sums > local_sums)
     chosen = select_voxels(received, wins & _fits(received, wins, local_counts, table.free_slots))
     replaced = np.isin(local.keys, chosen.keys)
     rows = local.rows_in(replaced)
-    table.remove(rows)
+    table.remove(rows)  # all of a voxel or nothing: parts of two maps do not fit
     table.append(chosen.gaussians)
     return InsertedVoxels(chosen, len(rows))
 

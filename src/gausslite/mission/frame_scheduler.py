@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.mapping.training import ITERATION_STAGES, SkippableStage, Stage
+from gausslite.mapping.stages import ITERATION_STAGES, SkippableStage, Stage
 
 Clock = Callable[[], float]
 """Monotonic seconds from an arbitrary start."""
@@ -176,6 +176,7 @@ class FrameScheduler:
         under_trained = late = False
         if self._settings is not None:
             behind_s = self._behind_s + seconds - self._settings.seconds_per_frame
+            # a longer overrun is given up, or it would starve the frames to come
             self._behind_s = min(max(behind_s, 0.0), self._settings.deadline_slack_s)
             late = behind_s > self._settings.deadline_slack_s
             under_trained = self._iterations < self._settings.min_iterations
@@ -207,6 +208,7 @@ def choose_skipped_stages(
         needed_s += expected_s[Stage.WARM_UP] + (settings.min_iterations - 1) * expected_s[cheapest_iteration]
     chosen: set[SkippableStage] = set()
     for skippable in settings.skip_stages:
+        # never the same twice: each runs at half the rate
         if needed_s > available_s and skippable not in skipped_before:
             chosen.add(skippable)
             needed_s -= sum(expected_s[stage] for stage in _STAGES_SKIPPED[skippable])

@@ -21,7 +21,7 @@ from gausslite.config.values import (
     write_correction,
     write_prior,
 )
-from gausslite.datasets.calibration import Calibration, Evidence, StatedValues, open_calibrator
+from gausslite.datasets.calibration import Calibration, FoundValue, StatedValues, open_calibrator
 from gausslite.datasets.folder import up_note
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source, usable_frames
@@ -142,7 +142,7 @@ def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> 
     return found
 
 
-def _report_estimate(evidence: Evidence) -> None:
+def _report_estimate(evidence: FoundValue) -> None:
     if not evidence.guaranteed:
         value = f" {evidence.value}" if len(evidence.value) <= _VALUE_WIDTH else ""
         line = f"{evidence.option}{value}: {'; '.join(evidence.reasons)}"

@@ -23,7 +23,7 @@ from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.codec.state_file import write_atomic
-from gausslite.datasets.folder import format_pose_rows
+from gausslite.datasets.pose_track import format_pose_rows
 from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, unit_up_axis

@@ -13,11 +13,11 @@ from gausslite.config.values import (
     CORRECTION_FORM,
     NONE,
     PRIOR_FORM,
+    not_empty,
     read_correction,
     read_prior,
     read_registration,
     read_target_points,
-    read_text,
     read_up_axis,
     write_correction,
     write_numbers,
@@ -121,7 +121,7 @@ class SourceSettings:
         '"sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
         key="source",
         metavar="SOURCE",
-        convert=read_text,
+        convert=not_empty,
         metadata=MAY_CHANGE,
     )
     frames: str = option(":", "frame numbers to use (default: all)", metavar="START:STOP:STEP", metadata=MAY_CHANGE)

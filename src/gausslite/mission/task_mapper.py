@@ -25,8 +25,8 @@ from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.pose_corrector import LoopCounts
 from gausslite.mapping.pose_estimation import CameraTracker
 from gausslite.mapping.poses import PoseTable
+from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.task_change import Reevaluation
-from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.mission.localisation_monitor import UNPLACED, Admission, LocalisationMonitor, LocalisationState
@@ -298,16 +298,17 @@ class TaskMapper:
         view = self._mapper.leave_out_moving(view, self._scheduler)
         if view.frame.defect:
             return self._skip_defect(frame, MOVING)
-        estimate = self._estimate_relevance(view)
+        estimate = self._estimate_relevance(view)  # w(u, v), Sec. III-B
         self._detected = estimate.detected or self._detected
-        lag_frames = self._apply_delayed(estimate.delayed)
-        reevaluation = self._reevaluate_keyframes()
+        lag_frames = self._apply_delayed(estimate.delayed)  # before the frame: its training uses that region
+        reevaluation = self._reevaluate_keyframes()  # a new task first needs what the map has of it
+        # seeding and training, Sec. III-C and III-D
         mapped = self._mapper.map_view(view, estimate.relevance, self._scheduler)
         if self._tracker is not None and mapped.T_world_camera is not None:
             if mapped.T_corrected_earlier is not None:
                 self._tracker.move(mapped.T_corrected_earlier)
             self._tracker.confirm(mapped.T_world_camera, mapped.anchor)
-        changed_roi = self._publish_changed_roi()
+        changed_roi = self._publish_changed_roi()  # only the region leaves the robot, Sec. III-E
         return FrameOutcome(
             index=frame.index,
             iterations=mapped.iterations,

@@ -103,7 +103,7 @@ def _object_mask(detection: Detection, depth_m: Float32[ndarray, "h w"], camera:
 
     An exact mask is not filled: in the demo, the vote's region would lose 0.7 dB.
     """
-    mask = foreground_mask(detection.mask, depth_m)
+    mask = foreground_mask(detection.mask, depth_m)  # a box of a chair shows the wall behind it too
     if is_convex(detection.phrase):
         return mask if detection.is_exact else filled_outline(mask, depth_m)
     return without_background_planes(mask, depth_m, camera)
@@ -126,7 +126,7 @@ def _lift(
     rows, columns = np.nonzero(own_pixels & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
         return None
-    step = max(1, len(rows) // _MAX_PIXELS)
+    step = max(1, len(rows) // _MAX_PIXELS)  # the median of a part is as good
     rows, columns = rows[::step], columns[::step]
     centres_px = np.stack([columns, rows], axis=1) + 0.5
     points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)

@@ -81,7 +81,7 @@ class Observation:
         time_ns: int = 0,
     ) -> Observation:
         """Return the observation of a mask's points: their median is the centroid, outliers are dropped."""
-        centroid_m = np.median(points_m, axis=0)
+        centroid_m = np.median(points_m, axis=0)  # not the mean: masks include background
         radius_m = 2.0 * float(np.median(np.linalg.norm(points_m - centroid_m, axis=1)))
         inliers_m = points_m[_is_inlier(points_m, centroid_m, radius_m)]
         cells = np.unique(VoxelGrid(CELL_M).keys(inliers_m.astype(np.float32)))
@@ -198,7 +198,7 @@ class Landmark:
     def add_weak(self, weak: Observation) -> None:
         """Count a weak detection of this object, without its inexact mask."""
         self.weak_count += 1
-        self.missed_in_a_row = 0
+        self.missed_in_a_row = 0  # weak, but seen
         self.score_sum += weak.score
         self.last_seen_ns = max(self.last_seen_ns, weak.time_ns)
         if weak.rival is not None:
@@ -208,7 +208,7 @@ class Landmark:
         """Merge another landmark into this one, and recompute the centroid."""
         self.is_given |= other.is_given
         self.seen_count += other.seen_count
-        if self._is_independent_of(other):
+        if self._is_independent_of(other):  # two images of one moment err alike
             self.view_count += other.view_count
             self.view_camera_m, self.view_ns = other.view_camera_m, other.view_ns
         self.weak_count += other.weak_count
@@ -240,6 +240,7 @@ class Landmark:
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
         if len(merged) > _MAX_CELLS:
+            # bounded: a room-sized mask would fill memory
             most_observed = np.sort(np.argsort(-total, kind="stable")[:_MAX_CELLS])
             merged, total = merged[most_observed], total[most_observed]
         self.cells, self.counts = merged, total
@@ -334,6 +335,7 @@ class ObjectMap:
             for other in doubles:
                 first.add(other)
                 self._objects.remove(other)
+            # the merged object may reach further ones
             doubles = [other for other in self.with_phrase(first.phrase) if other is not first and first.matches(other)]
         return first
 

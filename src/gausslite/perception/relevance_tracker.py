@@ -176,7 +176,7 @@ class RelevanceTracker:
         self._frames_since += 1
         is_keyframe = (
             T_world_keyframe is None
-            or self._frames_since >= self._settings.max_frames
+            or self._frames_since >= self._settings.max_frames  # objects move, and a still robot would never look
             or (self._needs_observation and frame.capture_time_ns - self._keyframe_ns >= INDEPENDENT_NS)
             or translation_m(T_world_keyframe, frame.T_world_camera) > self._settings.max_translation_m
             or rotation_angle_deg(T_world_keyframe, frame.T_world_camera) > self._settings.max_rotation_deg
@@ -229,6 +229,7 @@ class RelevanceTracker:
                 self._known_targets.append(landmark.number)
             own = [mask for owner, mask in detected if owner is landmark]
             if own:
+                # a detected mask is exact at its border
                 mask = refined_mask(np.logical_or.reduce(own), landmark.votes, frame)
             else:
                 mask = surface_mask(landmark.votes, frame)
@@ -244,9 +245,9 @@ class RelevanceTracker:
             self._seen[box.phrase] = (n + (not box.is_weak), *max((best, at), (box.score, frame.index)))
         excluded = self._excluded_pixels(detections, frame)
         kept = self._drop_excluded(self._drop_generic_anchors(detections), excluded)
-        depth_m = np.where(excluded, np.float32(0.0), depth_m)
+        depth_m = np.where(excluded, np.float32(0.0), depth_m)  # no other object may grow onto it
         localised = self._measured(lift_detections(kept, depth_m, frame, self._up), frame)
-        self._selector.observe(frame)
+        self._selector.observe(frame)  # before relations are evaluated: a selector may need the image
         visibility = VisibilityCheck(frame, frame.depth_m)
         self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
         shown = [
@@ -303,6 +304,7 @@ def merge_masks(
 ) -> RelevanceMap:
     """Return the binary w(u, v): 1 on every target's mask; in an overlap the pixel belongs to the smaller object."""
     target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
+    # largest first: the smaller object overwrites it
     for name, mask in sorted(masks, key=lambda named: int(np.count_nonzero(named[1])), reverse=True):
         target[mask] = targets.index(name)
     return RelevanceMap((target != NO_TARGET).astype(np.float32), target)

@@ -410,7 +410,7 @@ def rows_to_gaussians(
         means_m=rows[:, MEAN].copy(),
         quats_wxyz=quats / np.maximum(length, np.float32(1e-12)),
         scales_m=np.exp(rows[:, LOG_SCALE]),
-        opacities=decode_opacities(rows),
+        opacities=row_opacities(rows),
         rgb=rows[:, RGB].copy(),
         active=active.copy(),
         kappa=kappa.copy(),
@@ -418,7 +418,7 @@ def rows_to_gaussians(
     )
 
 
-def decode_opacities(rows: Float32[ndarray, "n 16"]) -> Float32[ndarray, " n"]:
+def row_opacities(rows: Float32[ndarray, "n 16"]) -> Float32[ndarray, " n"]:
     """Return the opacities in (0, 1): the sigmoid of the logits."""
     # tanh, unlike exp, cannot overflow
     return 0.5 * (np.tanh(0.5 * rows[:, OPACITY_LOGIT]) + 1.0)

@@ -19,9 +19,10 @@ from numpy import ndarray
 from gausslite.codec.subset_codec import CodecLimits
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import capped_size
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, UnavailableError
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.task import TaskGraph

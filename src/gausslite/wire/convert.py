@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.frame import MAX_DEPTH_M, Frame, has_whole_chunks, image_size, is_too_far
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Twist, require_rigid
 from gausslite.domain.relevance import PointM
 from gausslite.domain.voxel_changes import TileDigests

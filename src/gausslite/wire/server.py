@@ -24,7 +24,7 @@ from grpc_reflection.v1alpha import reflection
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
 from gausslite.process import handled_signals
-from gausslite.wire import security
+from gausslite.wire import call_limits, security
 from gausslite.wire.channel import KEEPALIVE_S, UNIX, connection_options, host_and_port
 from gausslite.wire.status import code_and_reason, to_status
 
@@ -38,7 +38,7 @@ LIVENESS = "liveness"
 Check = Callable[[], None]
 """Raises GaussLiteError while the service cannot work."""
 _LAST_CALLS_S = 1.0
-_HEALTH_LIMITS = security.CallLimits(connections=64, idle_s=10)
+_HEALTH_LIMITS = call_limits.CallLimits(connections=64, idle_s=10)
 # the longest path of a unix socket that Linux accepts
 _MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
@@ -149,7 +149,7 @@ async def start_server(
     listen: str,
     services: Sequence[Service],
     tls: security.Tls | None = None,
-    limits: security.CallLimits | None = None,
+    limits: call_limits.CallLimits | None = None,
     health_listen: str | None = None,
 ) -> RunningServer:
     """Serve on HOST:PORT (port 0 = any free port) or unix:PATH, with health and reflection; encrypted with `tls`.
@@ -158,10 +158,10 @@ async def start_server(
     encryption, so that connections to the other one cannot keep health checks out; None for no such address.
     Raises UnavailableError if the address is in use, InvalidInputError if it is not an address.
     """
-    limits = limits or security.CallLimits()
+    limits = limits or call_limits.CallLimits()
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     watches = [ReadinessWatch(service, health_servicer) for service in services]
-    interceptor = CallInterceptor(security.CallUsage(limits), watches)
+    interceptor = CallInterceptor(call_limits.CallUsage(limits), watches)
     server = grpc.aio.server(interceptors=[interceptor], options=(*_OPTIONS, *limits.connection_options))
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
     for service, watch in zip(services, watches, strict=True):
@@ -185,7 +185,7 @@ async def serve_until_stopped(
     services: Sequence[Service],
     background_task: Callable[[], Awaitable[None]] | None = None,
     tls: security.Tls | None = None,
-    limits: security.CallLimits | None = None,
+    limits: call_limits.CallLimits | None = None,
     health_listen: str | None = None,
 ) -> None:
     """Serve until a signal, or until the background task ends; then drain the server. Logs the addresses.
@@ -227,11 +227,11 @@ class _Method:
     name: str
     handler: Any
 
-    async def read_stream(self, context: Any, bandwidth: security.TokenBucket | None) -> AsyncIterator[Any]:
+    async def read_stream(self, context: Any, bandwidth: call_limits.TokenBucket | None) -> AsyncIterator[Any]:
         """Yield the requests at the caller's bandwidth; HTTP/2's flow control then slows the caller down."""
         # gRPC's iterator would keep the bytes of a request while the method works on it
         while (data := await context.read()) is not grpc.aio.EOF:  # type: ignore[attr-defined]
-            await security.wait_for_bandwidth(bandwidth, len(data))
+            await call_limits.wait_for_bandwidth(bandwidth, len(data))
             request = self.decode(data)
             del data
             yield request
@@ -249,9 +249,9 @@ class _Method:
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     """Check role and limits of a call, and end it with its error's status; unexpected ones are INTERNAL and logged."""
 
-    def __init__(self, usage: security.CallUsage, watches: Sequence[ReadinessWatch] = ()) -> None:
+    def __init__(self, usage: call_limits.CallUsage, watches: Sequence[ReadinessWatch] = ()) -> None:
         self._usage, self._watches = usage, watches
-        self._rejections = security.RejectionLog(_log)
+        self._rejections = call_limits.RejectionLog(_log)
 
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
         """Return a handler that runs the called method and converts its errors; foreign services stay unchanged."""
@@ -289,7 +289,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 if call.handler.request_streaming:
                     yield call.read_stream(context, bandwidth)
                 else:
-                    await security.wait_for_bandwidth(bandwidth, len(request))
+                    await call_limits.wait_for_bandwidth(bandwidth, len(request))
                     yield call.decode(request)
         except Exception as error:
             await self._abort(call.name, error, context)

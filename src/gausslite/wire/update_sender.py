@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_batch
 from gausslite.config.option import option
 from gausslite.config.values import read_numbers
-from gausslite.datasets.folder import pose_from_quaternion
+from gausslite.datasets.pose_track import pose_from_quaternion
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, QuotaError, UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb

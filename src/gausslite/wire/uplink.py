@@ -18,9 +18,9 @@ from gausslite.domain import errors
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.v1 import geometry_pb2
+from gausslite.wire.call_limits import TokenBucket
 from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import FusionClient, Session
-from gausslite.wire.security import TokenBucket
 from gausslite.wire.spool import Purpose, Spool, SpooledKeyframe
 from gausslite.wire.update_sender import UpdateSender, UplinkCounters, UplinkSettings
 

@@ -14,8 +14,8 @@ from gausslite.cli.main import main
 from gausslite.config.values import AUTO
 from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, MissingPluginError
+from gausslite.domain.lens import Lens
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.mission.recording import calibrate_with_messages, stated_values
 from gausslite.mission.runner import FrameStream

@@ -11,8 +11,9 @@ from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.camera_files import read_folder_camera
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera, Lens, LensModel
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.recording import CameraCorrection
 
 

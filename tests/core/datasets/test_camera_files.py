@@ -12,8 +12,8 @@ from tiny_sequences import HEIGHT, WIDTH, write_colour, write_seven_scenes, writ
 
 from gausslite.datasets.camera_files import lens_of, read_folder_camera
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import DatasetError
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.mission.recording import open_recorded
 
 FISHEYE_NAMES = [

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
-from gausslite.datasets.folder import estimate_up, nearest_rigid, pose_from_quaternion, slerp
+from gausslite.datasets.folder import estimate_up
+from gausslite.datasets.pose_track import nearest_rigid, pose_from_quaternion, slerp
 from gausslite.datasets.source import Source, select_frames
 from gausslite.domain.camera import Camera, back_project, project
 from gausslite.domain.errors import DatasetError

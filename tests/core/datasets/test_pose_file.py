@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
-from gausslite.datasets.folder import format_pose_rows, read_pose_rows
 from gausslite.datasets.open import open_reference, open_source
+from gausslite.datasets.pose_track import format_pose_rows, read_pose_rows
 from gausslite.domain.errors import DatasetError, GaussLiteError
 from gausslite.domain.pose import transform_of
 

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gausslite.domain.camera import Camera, CameraMotion, Lens
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.lens import Lens
 from gausslite.domain.pose import Trajectory, Twist
 
 TURN = Twist(np.zeros(3), np.array([0.0, 1.0, 0.0]))

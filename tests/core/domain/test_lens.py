@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.domain.camera import Lens
+from gausslite.domain.lens import Lens
 
 SLOPES = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 200))
 RAYS = np.stack([*SLOPES, np.ones(SLOPES.shape[1])], axis=1)

@@ -13,12 +13,14 @@ from gausslite.domain.pose import inverse, transform_of
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.density import densify
-from gausslite.mapping.keyframes import Keyframe, KeyframeStore, window_view
+from gausslite.mapping.keyframe_store import KeyframeStore
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.seeding import Seeds, insert_seeds
 from gausslite.mapping.settings import DensitySettings, KeyframeSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
+from gausslite.mapping.window_view import window_view
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import GRAD_2D_COUNT, GRAD_2D_SUM, MEAN, QUAT
 

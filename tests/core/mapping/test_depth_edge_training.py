@@ -10,8 +10,9 @@ from cpu_scenes import random_rows
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.frame import Frame
-from gausslite.mapping.keyframes import Keyframe, window_view
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.settings import ONLINE_RATES, KeyframeSettings
+from gausslite.mapping.window_view import window_view
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import LossWeights
 

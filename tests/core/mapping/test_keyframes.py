@@ -10,9 +10,11 @@ from mapping_scenes import middle_relevance, wall_frame
 from gausslite.domain.camera import CameraMotion
 from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.keyframes import Keyframe, KeyframeStore, motion_blur_px, tiles_touching, window_view
+from gausslite.mapping.keyframe_store import KeyframeStore, motion_blur_px
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.policies import uniform_policy
 from gausslite.mapping.settings import Components, KeyframeSettings
+from gausslite.mapping.window_view import tiles_touching, window_view
 from gausslite.render.cpu import CpuRasterizer
 
 

@@ -24,7 +24,7 @@ from gausslite.mapping.settings import (
     OptimizationSettings,
     SeedingSettings,
 )
-from gausslite.mapping.training import CountedScheduler, Stage
+from gausslite.mapping.stages import CountedScheduler, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import RGB, LossWeights

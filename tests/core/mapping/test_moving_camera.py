@@ -17,7 +17,7 @@ from gausslite.mapping.keyframes import frame_from_state, frame_state
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, MapperSettings, SeedingSettings
-from gausslite.mapping.training import CountedScheduler
+from gausslite.mapping.stages import CountedScheduler
 
 _APPROACH = CameraMotion(Twist(np.array([0.0, 0.0, 2.0]), np.zeros(3)), readout_s=0.05)
 

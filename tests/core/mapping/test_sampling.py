@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
-from gausslite.mapping.seeding import (
+from gausslite.mapping.pixel_sampling import (
     edge_magnitude,
     initial_spacing_m,
     neighbour_distance_px,

@@ -14,7 +14,8 @@ from gausslite.domain.frame import Frame
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import disable
 from gausslite.mapping.settings import MapperSettings, SaturationSettings
-from gausslite.mapping.training import CountedScheduler, RegionSaturation, Stage
+from gausslite.mapping.stages import CountedScheduler, Stage
+from gausslite.mapping.training import RegionSaturation
 from gausslite.render.cpu import CpuRasterizer
 
 SETTINGS = SaturationSettings(max_released=0.75, improving=0.12, saturated=0.04)

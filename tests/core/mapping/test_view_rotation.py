@@ -11,10 +11,11 @@ import pytest
 from mapping_scenes import map_frame, middle_relevance, wall_frame
 
 from gausslite.domain.errors import MapFileError
-from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.mapping.view_rotation import ViewRotation
+from gausslite.mapping.window_view import WindowView, window_view
 from gausslite.render.cpu import CpuRasterizer, CpuView
 from gausslite.render.rasterizer import StepReport
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings, choose_skipped_stages
 
 _NOT_RUN = (Stage.TRACKING, Stage.REEVALUATION, Stage.PRUNING, Stage.DENSIFICATION)

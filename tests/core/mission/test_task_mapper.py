@@ -12,7 +12,7 @@ from gausslite.domain.relevance import BallRegion
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
-from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper

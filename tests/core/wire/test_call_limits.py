@@ -16,15 +16,9 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, RateLimitError
+from gausslite.wire.call_limits import MESSAGE_BYTES, CallLimits, CallUsage, TokenBucket, wait_for_bandwidth
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.security import (
-    MESSAGE_BYTES,
-    Caller,
-    CallLimits,
-    CallUsage,
-    TokenBucket,
-    wait_for_bandwidth,
-)
+from gausslite.wire.security import Caller
 from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 

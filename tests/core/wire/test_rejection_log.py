@@ -11,7 +11,7 @@ import pytest
 from fusion_running import GRID, fusion_server
 
 from gausslite.domain.errors import MismatchError
-from gausslite.wire.security import RejectionLog
+from gausslite.wire.call_limits import RejectionLog
 
 LOG = logging.getLogger("test")
 

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 
 from gausslite.codec.json import graph_as_json, graph_from_json
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
 from gausslite.domain.frame import Frame, image_size, is_too_far
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Twist, require_rigid
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TargetRole, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelBatch, VoxelGrid

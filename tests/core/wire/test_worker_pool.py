@@ -10,7 +10,8 @@ import pytest
 from call_context import Context
 
 from gausslite.domain.errors import RateLimitError
-from gausslite.wire.security import CallLimits, CallUsage, caller_or_connection
+from gausslite.wire.call_limits import CallLimits, CallUsage
+from gausslite.wire.security import caller_or_connection
 from gausslite.wire.worker_pool import WorkerPool
 
 FLOOD, GOOD = Context("ipv4:127.0.0.1:5001"), Context("ipv4:127.0.0.1:5002")

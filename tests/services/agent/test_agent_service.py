@@ -18,7 +18,7 @@ from agent_running import TASK, Agent, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from waiting import wait_until
 
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -30,6 +30,7 @@ from gausslite.domain.errors import (
     TaskError,
 )
 from gausslite.domain.frame import Frame
+from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import BallRegion, PointedObject
 from gausslite.domain.task import TargetRole, TaskGraph

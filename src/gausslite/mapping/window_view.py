@@ -1,0 +1,98 @@
+"""Prepare a keyframe for training: its images, the tiles of its region, its pixel weights (Sec. III-D.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+
+from gausslite.domain.frame import Frame, without_depth_edges
+from gausslite.domain.pose import inverse
+from gausslite.mapping.keyframes import Keyframe
+from gausslite.mapping.settings import KeyframeSettings
+from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subset, TrainingView
+
+_ROI_MARGIN_PX = 5
+"""Margin around the ROI within which tiles are rendered in the active phase: SSIM's window needs it."""
+_SSIM_WINDOW_PX = 11
+_ALL_MEASURED = 0.999
+_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
+"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowView:
+    """A keyframe prepared for training."""
+
+    keyframe: Keyframe
+    training_view: TrainingView  # prepared by the rasterizer, whole or masked to the ROI's tiles
+    half_view: TrainingView | None  # in half size, for iterations on whole images; None: they use training_view
+    T_camera_world: Float64[ndarray, "4 4"]
+    roi: Subset  # the 16x16 tiles that touch the ROI or its margin
+
+    @property
+    def shows_roi(self) -> bool:
+        """True if a pixel belongs to the ROI."""
+        return self.roi.tiles is not None and bool(self.roi.tiles.any())
+
+    @property
+    def roi_share(self) -> float:
+        """Share of the image's tiles that the active phase renders."""
+        return 1.0 if self.roi.tiles is None else float(self.roi.tiles.mean())
+
+
+def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
+    """Prepare a keyframe for training. The margin gives the SSIM window its neighbours at the ROI's border."""
+    frame = keyframe.frame
+    tiles, pixel_weights = roi_weights(keyframe.relevance.pixel_weights, settings.roi_context_weight)
+    depth_m = without_depth_edges(frame.depth_m, settings.depth_edge_px)
+    return WindowView(
+        keyframe=keyframe,
+        training_view=rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, pixel_weights, frame.motion),
+        half_view=_half_view(frame, depth_m, rasterizer) if depth_m.size >= settings.half_size_from_px else None,
+        T_camera_world=inverse(frame.T_world_camera),
+        roi=Subset(tiles),
+    )
+
+
+def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Rasterizer) -> TrainingView:
+    """Prepare the image in half size: colours averaged over 2x2 pixels, depths too where all four are measured."""
+    width, height = frame.camera.width_px // 2, frame.camera.height_px // 2
+    rgb, halved_m, measured = (
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        for image in (frame.rgb, depth_m, (depth_m > 0).astype(np.float32))
+    )
+    halved_m = np.where(measured > _ALL_MEASURED, halved_m, np.float32(0.0))
+    camera = frame.camera.resized(width, height)
+    return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, _HALF_SIZE_DILATION_PX2)
+
+
+def roi_weights(
+    pixel_weights: Float32[ndarray, "h w"], context_weight: float
+) -> tuple[Bool[ndarray, "th tw"], Float32[ndarray, "h w"]]:
+    """Return the tiles of the pixels with a weight, and the weights with those of the other pixels inside the tiles."""
+    tiles = tiles_touching(pixel_weights > 0, _ROI_MARGIN_PX)
+    if context_weight > 0:
+        context = np.float32(context_weight) * _pixels_inside(tiles, pixel_weights.shape)
+        pixel_weights = np.maximum(pixel_weights, context)
+    return tiles, pixel_weights
+
+
+def tiles_touching(mask: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th tw"]:
+    """Return the 16x16 tiles that touch the mask dilated by margin_px."""
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
+    dilated = cv2.dilate(mask.view(np.uint8), kernel)
+    height, width = mask.shape
+    padded = np.pad(dilated, ((0, -height % TILE_PX), (0, -width % TILE_PX)))
+    by_rows = padded.reshape(-1, TILE_PX, padded.shape[1]).max(axis=1)
+    tiles: Bool[ndarray, "th tw"] = by_rows.reshape(len(by_rows), -1, TILE_PX).any(axis=2)
+    return tiles
+
+
+def _pixels_inside(tiles: Bool[ndarray, "th tw"], shape: tuple[int, ...]) -> Bool[ndarray, "h w"]:
+    """Return the pixels whose whole SSIM window lies in these tiles; outside them nothing is rendered."""
+    rendered = np.repeat(np.repeat(tiles, TILE_PX, axis=0), TILE_PX, axis=1)[: shape[0], : shape[1]]
+    return cv2.erode(rendered.astype(np.uint8), np.ones((_SSIM_WINDOW_PX, _SSIM_WINDOW_PX), np.uint8)) > 0
