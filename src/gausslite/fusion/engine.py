@@ -125,7 +125,7 @@ class FusionEngine:
         UnavailableError (a fresh map while the agent has too many).
         """
         with self._changing:
-            for ended in self.members.admit(agent_id, requested, token):
+            for ended in self.members.admit(agent_id, requested, token):  # without updates: they make room
                 self._remove_all(ended)
             if fresh_map and len(self._former(agent_id)) > MAX_FORMER_MAPS:
                 name = quote_name(agent_id)
@@ -134,7 +134,7 @@ class FusionEngine:
             if fresh_map:
                 self._begin_map(agent_id)
                 self._release_former(agent_id)
-            self._checks.record_join(agent_id)
+            self._checks.record_join(agent_id)  # from now on, kappa may grow at the permitted rate
             highest = self.store.totals(agent_id).highest_update_seq
             return JoinResult(session, highest, self.maps.revision(), self.keyframes.indices(agent_id))
 
@@ -201,6 +201,7 @@ class FusionEngine:
 
     def _commit(self, group: Sequence[PendingUpdate]) -> None:
         """Check, store and record the next slice of each message."""
+        # first the disk: an acknowledged voxel is never lost
         stored = store_slices(self.store, [update for update in group if self._is_permitted(update)])
         failed = self._record([(update.agent_id, outcome.accepted) for update, outcome in stored])
         for update, outcome in stored:
@@ -234,7 +235,7 @@ class FusionEngine:
         name = quote_name(subset.agent_id)
         former = self._former(subset.agent_id)
         if former:
-            self._release(min(former, key=self.maps.won_voxels))
+            self._release(min(former, key=self.maps.won_voxels))  # the one that the fused map misses least
             raise UnavailableError(f"agent {name}: a former map is being deleted to make room; try again in a moment")
         raise QuotaError(
             f"agent {name}: expected voxels of at most {limit} bytes of memory (memory-mb divided by quota-agents), "
@@ -249,7 +250,7 @@ class FusionEngine:
         """
         for agent_id, accepted in stored:
             if len(accepted):
-                before = self._unrecorded.get(agent_id, accepted)
+                before = self._unrecorded.get(agent_id, accepted)  # of commits whose record failed
                 self._unrecorded[agent_id] = np.union1d(before, accepted)
         failed: dict[str, GaussLiteError] = {}
         for agent_id in self._unrecorded:

@@ -283,10 +283,10 @@ class UpdateQueue:
                 agent_id = self._waiting[0][2]
                 update = self._pending[agent_id][0]
                 own_cost = update.cost
-                if taken and cost + own_cost > max_bytes:
+                if taken and cost + own_cost > max_bytes:  # at least one, however large
                     break
                 heapq.heappop(self._waiting)
-                self._round += own_cost / len(self._pending)
+                self._round += own_cost / len(self._pending)  # the waiting agents share the time equally
                 cost += own_cost
                 # it is decoded now
                 self._bytes -= update.encoded_bytes

@@ -111,7 +111,7 @@ class KeyframeStore:
             self._recent = [*self._recent, new][-self._limits.window :]
             self._buffer.append(new)
             while len(self._buffer) > self._limits.buffer:
-                del self._buffer[_most_redundant(self.buffer)]
+                del self._buffer[_most_redundant(self.buffer)]  # thinned evenly: the whole mission stays covered
         # drop unused frames only now: `get` finds the last frame until the next one comes
         self._keyframes = {frame: self._keyframes[frame] for frame in self._ids()}
         self._views = {frame: self._views[frame] for frame in (*self._recent, *self._long_term)}
@@ -227,6 +227,7 @@ class KeyframeStore:
         for shows_roi in (True, False):
             kind = [frame for frame in frames if self._views[frame].shows_roi == shows_roi]
             while len(kind) > self._limits.long_term_keyframes:
+                # both kinds: views without the region keep the background
                 del kind[_most_redundant([self._keyframes[frame] for frame in kind])]
             kept.update(kind)
         self._long_term = [frame for frame in frames if frame in kept]

@@ -65,6 +65,7 @@ def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Raste
         cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         for image in (frame.rgb, depth_m, (depth_m > 0).astype(np.float32))
     )
+    # a mean with an unmeasured pixel would be too near
     halved_m = np.where(measured > _ALL_MEASURED, halved_m, np.float32(0.0))
     camera = frame.camera.resized(width, height)
     return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, _HALF_SIZE_DILATION_PX2)
@@ -76,6 +77,7 @@ def roi_weights(
     """Return the tiles of the pixels with a weight, and the weights with those of the other pixels inside the tiles."""
     tiles = tiles_touching(pixel_weights > 0, _ROI_MARGIN_PX)
     if context_weight > 0:
+        # neighbours would drift into the region
         context = np.float32(context_weight) * _pixels_inside(tiles, pixel_weights.shape)
         pixel_weights = np.maximum(pixel_weights, context)
     return tiles, pixel_weights

@@ -63,7 +63,7 @@ class Evidence:
         has_detections = (
             landmark.view_count >= self.settings.min_seen or landmark.best_score >= self.settings.confident_score
         )
-        is_found = seen >= self.settings.min_seen_fraction * (seen + missed)
+        is_found = seen >= self.settings.min_seen_fraction * (seen + missed)  # ghosts of a detector appear in few views
         if not (has_detections and is_found) or self.rival(landmark) is not None:
             return LandmarkState.CANDIDATE
         is_known = seen + _WEAK_SHARE * landmark.weak_count >= _MIN_SEEN_KNOWN
@@ -122,7 +122,7 @@ class VisibilityCheck:
         The cells of an object that was removed are also visible: the frame then shows the surface behind them.
         """
         distance_m = float(np.linalg.norm(landmark.centroid_m - self.frame.T_world_camera[:3, 3]))
-        if distance_m > _MAX_DISTANCE_RATIO * landmark.farthest_m:
+        if distance_m > _MAX_DISTANCE_RATIO * landmark.farthest_m:  # too small in the image: a miss proves nothing
             return False
         cells = transform_points(inverse(self.frame.T_world_camera), landmark.footprint_m().astype(np.float64))
         z_m = cells[:, 2]
@@ -133,5 +133,5 @@ class VisibilityCheck:
         columns, rows = pixels[inside].T
         sensed_m = self.depth_m[rows, columns]
         reach_m = sensed_m * (1.0 + _DEPTH_SLACK_SHARE) + _DEPTH_SLACK_M
-        unoccluded = (sensed_m > 0) & (z_m[inside] <= reach_m)
+        unoccluded = (sensed_m > 0) & (z_m[inside] <= reach_m)  # nothing was measured in front of it
         return bool(np.count_nonzero(unoccluded) >= _MIN_VISIBLE_SHARE * len(cells))

@@ -165,14 +165,14 @@ def _own_pixels(detection: Detection, of_noun: Mapping[str, Bool[ndarray, "h w"]
 def foreground_mask(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     """Return the nearest layer of depth with enough of the mask, between almost empty bins; unmeasured pixels stay."""
     known = mask & (depth_m > 0)
-    log_depths = np.log(depth_m[known])
+    log_depths = np.log(depth_m[known])  # noise grows with the depth
     if len(log_depths) < _MIN_PIXELS:
         return mask
     bins = ((log_depths - log_depths.min()) / _DEPTH_BIN_SHARE).astype(np.int64)
     counts = np.bincount(bins)
     almost_empty = max(_MIN_BIN_SHARE * len(bins), _MIN_BIN_TO_PEAK * float(counts.max()))
     filled = np.flatnonzero(counts > almost_empty)
-    layer = np.cumsum(np.diff(filled, prepend=filled[0]) > _GAP_BINS)
+    layer = np.cumsum(np.diff(filled, prepend=filled[0]) > _GAP_BINS)  # a gap in depth separates object and background
     shares = np.bincount(layer, weights=counts[filled]) / len(bins)
     nearest = filled[layer == np.flatnonzero(shares >= min(_MIN_LAYER_SHARE, shares.max()))[0]]
     front = mask.copy()
@@ -190,6 +190,7 @@ def filled_outline(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"])
     hull = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
     nearest_m, farthest_m = np.percentile(known, (_OUTER_PERCENT, 100.0 - _OUTER_PERCENT))
     slack_m = _DEPTH_SLACK_M
+    # in the outline, at the depth of the object
     added = hull & ~mask & (depth_m >= nearest_m - slack_m) & (depth_m <= farthest_m + slack_m)
     wide = np.ones((_MIN_ADDED_PX, _MIN_ADDED_PX), np.uint8)
     filled: Bool[ndarray, "h w"] = mask | (cv2.morphologyEx(added.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0)
@@ -216,9 +217,9 @@ def without_background_planes(
     points_m = back_project(depths_m, camera, window[1].start, window[0].start).astype(np.float64)
     limits_m = np.maximum(_PLANE_DISTANCE_M, _PLANE_DISTANCE_SHARE * depths_m)
     left = inside.copy()
-    for plane in _planes(points_m[_ring(inside) & (depths_m > 0)]):
+    for plane in _planes(points_m[_ring(inside) & (depths_m > 0)]):  # what goes on beside the mask is not the object
         left &= (depths_m == 0) | (np.abs(points_m @ plane[:3] - plane[3]) > limits_m)
-    if np.count_nonzero(left) < _MIN_LEFT_SHARE * np.count_nonzero(inside):
+    if np.count_nonzero(left) < _MIN_LEFT_SHARE * np.count_nonzero(inside):  # flat itself, such as a rug on the floor
         return mask
     out = mask.copy()
     out[window] = left
@@ -239,7 +240,7 @@ def _planes(points_m: Float64[ndarray, "n 3"]) -> list[Float64[ndarray, "4"]]:
     """Return unit normals and offsets of some planes, the largest first; each from random triples of points."""
     points_m = points_m[:: max(1, len(points_m) // _MAX_RING_POINTS)]
     min_points = max(_MIN_RING_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # the same planes in each run
     planes: list[Float64[ndarray, "4"]] = []
     while len(planes) < _MAX_PLANES and len(points_m) >= min_points:
         corners = points_m[rng.integers(len(points_m), size=(_PLANE_SAMPLES, 3))]
@@ -263,7 +264,7 @@ class FittedPlane:
 
     normal: Float64[ndarray, "3"]
     extent_m: float
-    thickness_m: float  # of the points beside it
+    thickness_m: float  # across the plane
 
     @classmethod
     def of(cls, points_m: Float64[ndarray, "n 3"]) -> FittedPlane:

@@ -176,7 +176,7 @@ class SurfaceVotes:
         sizes_m = VOXEL_SIZES_M
         if np.count_nonzero(self.inside) > MAX_INSIDE_VOXELS and self.voxel_m < sizes_m[-1]:
             return self.coarsened(next(size for size in sizes_m if size > self.voxel_m))._limited()
-        kept = np.sort(np.lexsort((-self.outside, -self.inside))[:MAX_VOXELS])
+        kept = np.sort(np.lexsort((-self.outside, -self.inside))[:MAX_VOXELS])  # the least voted ones say least
         return replace(self, keys=self.keys[kept], inside=self.inside[kept], outside=self.outside[kept])
 
     def is_on_surface(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
@@ -189,7 +189,7 @@ class SurfaceVotes:
 
     @cached_property
     def _is_inside(self) -> Bool[ndarray, " n"]:
-        is_inside = self.inside >= self.outside
+        is_inside = self.inside >= self.outside  # masks err at borders, differently in each view
         is_inside[is_inside] = is_in_large_part(self._grid.centres_m(self.keys[is_inside]), self.inside[is_inside])
         return is_inside
 
@@ -263,6 +263,7 @@ def snapped_to_edges(mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -
     part = mask[window]
     lab = cv2.cvtColor(np.ascontiguousarray(rgb[window]), cv2.COLOR_RGB2LAB).astype(np.float32) / np.float32(255)
     kernel = np.ones(_edge_window(), np.uint8)
+    # only there is a mask inexact
     near_outline = cv2.dilate(part.astype(np.uint8), kernel) > cv2.erode(part.astype(np.uint8), kernel)
     share = _guided_filter(lab, part.astype(np.float32), near_outline)
     snapped = mask.copy()

@@ -163,7 +163,7 @@ class Spool:
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
             self._database.create_function("crc", -1, _crc, deterministic=True)
             self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = NORMAL")
+            self._database.execute("PRAGMA synchronous = NORMAL")  # the head tells what a power failure has lost
             self._check_pages()
             self._database.executescript(_SCHEMA)
             self._add_new_columns()
@@ -244,6 +244,7 @@ class Spool:
         double the share; more often: by four times the share. Voxels of the handover follow when nothing else is due.
         """
         keyframes = [_Due(*row) for row in self._select(_DUE_KEYFRAMES)]
+        # both are sorted by value per byte
         due = heapq.merge(self._due_voxels(Purpose.ROI, resend_threshold), keyframes, key=lambda due: due.place)
         purpose, chosen = Purpose.ROI, _take(due, max_bytes)
         if not chosen:
@@ -306,7 +307,9 @@ class Spool:
         with self._transaction():
             keys, _ = self._acknowledged()
             keys = keys[np.isin(tiles_of(keys), lost)]
+            # no more than the server claims
             acknowledged = min(int(self._property("acknowledged_seq") or 0), highest_update_seq)
+            # as never sent: no threshold delays them
             self._database.executemany(_RESEND, ((key,) for key in keys.tolist()))
             properties = [("incarnation_id", incarnation_id), ("acknowledged_seq", acknowledged)]
             self._database.executemany("INSERT OR REPLACE INTO properties VALUES (?, ?)", properties)

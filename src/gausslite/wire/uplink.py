@@ -175,6 +175,7 @@ class Uplink:
         """Join if needed, send what is due and mark what is acknowledged. False if nothing was due."""
         if time.monotonic() >= self._next_check_s:
             self._check_server()
+        # at the end, the last state of each voxel counts
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
         due = self.spool.next_round(max_bytes, resend_threshold)
@@ -185,11 +186,12 @@ class Uplink:
         if is_new_session:
             # the comparison of digests may have added updates
             due = self.spool.next_round(max_bytes, resend_threshold)
-        self._send_report(session)
+        self._send_report(session)  # small, and the team finds objects by it: before the voxels
         if due is None:
             return True
         if due.voxels is not None:
             messages = self._sender.encode(due.voxels, session)
+            # before sending: a lost message has used the band too
             self._token_bucket.spend(sum(len(part.request.subset) for part in messages.values()))
             self._sender.send(messages)
         if due.keyframes:
@@ -220,7 +222,7 @@ class Uplink:
         """If the server may have lost updates, compare digests and mark as unsent what differs."""
         if self.spool.is_stored_by(session.incarnation_id, session.highest_update_seq):
             return
-        acknowledged = self.spool.acknowledged_digests()
+        acknowledged = self.spool.acknowledged_digests()  # digests of tiles: a few bytes in place of the map
         stored = self._client.stored_digests(session.session_id) if len(acknowledged.tiles) else acknowledged
         resent = self.spool.begin_sending_to(
             session.incarnation_id, session.highest_update_seq, acknowledged.differing(stored)
@@ -282,12 +284,12 @@ class Uplink:
             # logged once and not at every retry, because a robot may be offline for hours
             _log.warning("uplink: %s; retrying", error)
             self._last_error = str(error)
-        if isinstance(error, errors.NameInUseError):
+        if isinstance(error, errors.NameInUseError):  # its lease may end: ask again
             self._session = None
         if isinstance(error, errors.SessionUnknownError):
             self._forget_session()
         if isinstance(error, (errors.QuotaError, errors.StorageError)):
-            self._sender.halve_messages()
+            self._sender.halve_messages()  # a smaller one may fit what is left
         with self._changed:
             self._connected = False
             self._next_round_s = time.monotonic() + self._retry_delay.after(error)
