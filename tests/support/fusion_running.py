@@ -94,10 +94,10 @@ def fusion_server(
     settings: FusionSettings | None = None,
     refine: RefineSettings | None = None,
     tls: Tls | None = None,
-    address: str = "127.0.0.1:0",
+    address: str | None = None,
     aligner: FrameAligner | None = None,
 ) -> Iterator[RunningServer]:
-    """Start a fusion server on a free port or `address` with the reference rasterizer; the caller owns the store.
+    """Start a fusion server as `serving` does, with the reference rasterizer; the caller owns the store.
 
     With tls the client uses the server's certificate; the stub and the channel do not work then.
     """

@@ -111,7 +111,7 @@ def test_a_certificate_has_its_own_limit_and_the_others_go_on(tmp_path: Path) ->
 
 
 def test_connections_are_limited() -> None:
-    with serving([parser_service(RuleParser())], limits=CallLimits(connections=5)) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=CallLimits(connections=5)) as server:
         opened = list(connections(server.address, 20))
         assert sum(not is_closed(connection) for connection in opened) <= 5
         for connection in opened:
@@ -121,7 +121,7 @@ def test_connections_are_limited() -> None:
 
 
 def test_idle_connections_do_not_lock_out_who_is_connected_already() -> None:
-    with serving([parser_service(RuleParser())], limits=CallLimits(connections=5)) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=CallLimits(connections=5)) as server:
         with grpc.insecure_channel(server.address) as channel:
             check = health_pb2_grpc.HealthStub(channel).Check
             assert check(health_pb2.HealthCheckRequest(), timeout=20, wait_for_ready=True).status == SERVING
@@ -141,7 +141,7 @@ def test_idle_connections_do_not_lock_out_who_is_connected_already() -> None:
 
 def test_an_own_address_for_health_answers_while_idle_connections_take_the_other() -> None:
     limits = CallLimits(connections=200)
-    with serving([parser_service(RuleParser())], limits=limits, health_listen="127.0.0.1:0") as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=limits, health_listen="127.0.0.1:0") as server:
         opened = list(connections(server.address, 300))
         # until the server refuses the newest one
         opened[-1].settimeout(20)
@@ -161,7 +161,7 @@ def test_an_own_address_for_health_answers_while_idle_connections_take_the_other
 
 
 def test_a_connection_without_a_call_is_closed() -> None:
-    with serving([parser_service(RuleParser())], limits=CallLimits(idle_s=1)) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=CallLimits(idle_s=1)) as server:
         (connection,) = connections(server.address, 1)
         connection.settimeout(20)
         received = b""

@@ -50,7 +50,7 @@ def test_many_callers_take_bounded_memory() -> None:
 
 
 def test_a_server_logs_the_calls_that_it_refuses(caplog: pytest.LogCaptureFixture) -> None:
-    with fusion_server() as t:
+    with fusion_server(address="127.0.0.1:0") as t:
         t.client.join("ant", GRID, world_frame="map")
         for _ in range(20):
             with pytest.raises(MismatchError):
