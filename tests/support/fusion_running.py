@@ -81,10 +81,7 @@ class RunningServer:
 
 def request(session_id: str, subset: RoiSubset, grid: VoxelGrid = GRID) -> pb.ContributeSubsetsRequest:
     return pb.ContributeSubsetsRequest(
-        session_id=session_id,
-        sequence=subset.message_seq,
-        purpose=pb.PURPOSE_ROI,
-        subset=encode_subset(subset, grid),
+        session_id=session_id, sequence=subset.message_seq, purpose=pb.PURPOSE_ROI, subset=encode_subset(subset, grid)
     )
 
 

@@ -19,12 +19,7 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeds, insert_seeds, visible_means
-from gausslite.mapping.settings import (
-    DensitySettings,
-    KeyframeSettings,
-    MapperSettings,
-    SeedingSettings,
-)
+from gausslite.mapping.settings import DensitySettings, KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings

@@ -18,14 +18,7 @@ from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, RateLimitError
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.security import (
-    MESSAGE_BYTES,
-    Caller,
-    CallLimits,
-    CallUsage,
-    TokenBucket,
-    wait_for_bandwidth,
-)
+from gausslite.wire.security import MESSAGE_BYTES, Caller, CallLimits, CallUsage, TokenBucket, wait_for_bandwidth
 from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 

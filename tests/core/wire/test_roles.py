@@ -94,10 +94,7 @@ def test_a_session_is_of_use_only_to_the_certificate_that_opened_it(certs: Path)
     ):
         session = owner.join("husky-1", GRID).session_id
         message = request(session, make_subset("husky-1", 1, {0: [1]}))
-        for call in (
-            lambda: list(thief.contribute([message], 20.0)),
-            lambda: thief.leave(session, forget=True),
-        ):
+        for call in (lambda: list(thief.contribute([message], 20.0)), lambda: thief.leave(session, forget=True)):
             with pytest.raises(NotPermittedError, match="'husky-1': expected a certificate that names it"):
                 call()
         assert len(list(owner.contribute([message], 20.0))) == 1

@@ -15,11 +15,7 @@ from uplink_running import EAGER, WAIT_S, accepted, expected_kappas, scripted, s
 from waiting import wait_until
 
 from gausslite.cli.main import main
-from gausslite.domain.errors import (
-    InvalidInputError,
-    MismatchError,
-    StorageError,
-)
+from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid

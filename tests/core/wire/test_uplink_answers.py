@@ -176,8 +176,7 @@ def test_after_any_losses_the_server_has_the_latest_updates(
 ) -> None:
     server = FlakyServer(faults)
     service = Service(
-        "gausslite.v1.FusionService",
-        lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running),
+        "gausslite.v1.FusionService", lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running)
     )
     with serving([service]) as running, uplink(running.address) as link:
         for voxels in enqueued:

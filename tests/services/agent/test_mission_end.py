@@ -166,14 +166,7 @@ def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subpr
 
 @pytest.mark.slow
 def test_sigterm_hands_over_within_the_grace_period(fusion: RunningServer, tmp_path: Path) -> None:
-    options = (
-        "--set",
-        "handover=true",
-        "--set",
-        "grace-period=60",
-        "--out",
-        str(tmp_path),
-    )
+    options = ("--set", "handover=true", "--set", "grace-period=60", "--out", str(tmp_path))
     with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
         client.assign_task("Pick up the cup")
         list(client.ingest([red_frame(index) for index in range(12)]))

@@ -30,10 +30,7 @@ def test_where_is_the_mug(fusion: RunningServer) -> None:
     assert mug.landmark.centroid_m == pytest.approx((1.0, 2.0, 3.0))
     assert mug.landmark.size_m == pytest.approx((0.2, 0.2, 0.2))
     assert mug.landmark.confidence == pytest.approx(0.75)
-    assert [(each.agent_id, each.target, each.last_seen_ns) for each in mug.observers] == [
-        ("ant", 0, 9),
-        ("bee", 0, 9),
-    ]
+    assert [(each.agent_id, each.target, each.last_seen_ns) for each in mug.observers] == [("ant", 0, 9), ("bee", 0, 9)]
     assert fusion.client.query_objects("sofa") == ()
     assert [list(each.targets) for each in fusion.client.status().agents] == [["mug"], ["mug"]]
     # a later report replaces the earlier one

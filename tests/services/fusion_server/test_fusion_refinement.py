@@ -10,12 +10,7 @@ from plugin_entries import register
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import (
-    InvalidInputError,
-    MismatchError,
-    MissingPluginError,
-    QuotaError,
-)
+from gausslite.domain.errors import InvalidInputError, MismatchError, MissingPluginError, QuotaError
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.plugins import Group

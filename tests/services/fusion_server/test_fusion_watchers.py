@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from fusion_running import GRID, RunningServer, keys, make_subset
 
-from gausslite.domain.errors import (
-    RevisionGoneError,
-)
+from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, empty_batch
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import MapUpdate
@@ -119,8 +117,7 @@ def test_a_large_map_is_sent_in_several_blocks_of_one_revision(fusion: RunningSe
     session = fusion.client.join("ant", GRID).session_id
     for part in range(3):
         fusion.contribute_subsets(
-            session,
-            make_subset("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)}),
+            session, make_subset("ant", part + 1, {cell: [1] * 8 for cell in range(part * 1000, part * 1000 + 1000)})
         )
     blocks = []
     for block in fusion.client.watch():
