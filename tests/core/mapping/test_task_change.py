@@ -157,7 +157,7 @@ def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
     assert mapper.store.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
     assert any(view.shows_roi for view in mapper.store.window)
-    for keyframe in mapper.keyframes():
+    for keyframe in mapper.store.kept:
         np.testing.assert_array_equal(keyframe.relevance.roi, RIGHT.mask(keyframe.frame))
 
 

@@ -172,7 +172,7 @@ def test_waiting_frames_are_dropped_at_shutdown() -> None:
     worker.close()
     assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
     with pytest.raises(UnavailableError, match="shutting down"):
-        worker.run(lambda mapper: mapper.count)
+        worker.run(lambda mapper: mapper.table.count)
 
 
 def test_a_frame_larger_than_a_message_is_made_smaller_and_the_stream_continues(robot: Agent) -> None:

@@ -139,7 +139,7 @@ def test_handover_brings_the_whole_map_and_the_keyframes(fusion: RunningServer, 
     with agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
-        keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
+        keyframes = worker.run(lambda mapper: mapper.store.kept).result(20)
         stored = stored_keyframe_from_message(fusion.client.keyframe(agent.agent_id))
     assert stored is not None
     assert stored.roi is not None

@@ -57,7 +57,7 @@ def test_a_handover_on_request_brings_the_whole_map_and_the_keyframes(fusion: Ru
         list(a.client.ingest([frame(index) for index in range(6)]))
         response = a.client.end_mission(handover=True)
         [stored] = fusion.client.status().agents
-        kept = a.worker.run(lambda mapper: mapper.keyframes()).result(20)
+        kept = a.worker.run(lambda mapper: mapper.store.kept).result(20)
     assert stored.gaussians == response.gaussians
     assert stored.handover_bytes > 0
     assert stored.keyframes == len(kept) > 0
