@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from other_process import run_python
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE_FOLDERS = (ROOT / "src", *sorted((ROOT / "services").glob("*")))
@@ -83,13 +82,7 @@ def violations(
 
 def test_layers_of_pyproject_hold() -> None:
     pytest.importorskip("importlinter", reason="import-linter comes with the dev extra")
-    done = subprocess.run(
-        [sys.executable, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    done = run_python("-c", "from importlinter.cli import lint_imports_command; lint_imports_command()", cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -151,7 +144,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
         "    importlib.import_module(module)\n"
         f"    print(*[(module, name) for name in {HEAVY!r} if name in sys.modules], end='')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
 
@@ -165,7 +158,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
 )
 def test_a_program_imports_what_it_uses(program: str, unused: tuple[str, ...]) -> None:
     code = f"import sys, {program}; print(*[name for name in sys.modules if name.startswith('gausslite.')])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     packages = tuple(f"gausslite.{package}" for package in unused)
     assert [name for name in done.stdout.split() if belongs_to(name, packages)] == []
@@ -177,7 +170,7 @@ def test_help_lists_every_command_without_numpy() -> None:
         "try:\n    main(['--help'])\nexcept SystemExit as end:\n    assert end.code == 0\n"
         "assert 'numpy' not in sys.modules"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     for command in ("map", "demo", "parse", "eval", "fuse", "models", "bench"):
         assert command in done.stdout

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import tomllib
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires
 from pathlib import Path
 from typing import Any
 
 import pytest
+from other_process import environment_without, run_python
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -62,15 +60,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     visible = required | {name for name in packages_distributions() if name.startswith("gausslite")}
     hidden = {name for name in packages_distributions() if name.isidentifier()} - visible
     out = tmp_path_factory.mktemp("minimal")
-    folders = filter(None, (str(SUPPORT / "without_extras"), os.environ.get("PYTHONPATH")))
-    done = subprocess.run(
-        [sys.executable, str(SUPPORT / "minimal_install.py"), str(out), ",".join(sorted(sim))],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(folders), "HIDDEN_PACKAGES": ",".join(sorted(hidden))},
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    arguments = SUPPORT / "minimal_install.py", out, ",".join(sorted(sim))
+    done = run_python(*arguments, environment=environment_without(*sorted(hidden)), timeout_s=280)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from other_process import environment_without, run_python
 from tiny_sequences import FEW_GAUSSIANS, write_tum
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -95,15 +93,8 @@ def test_the_core_works_without_a_package_whose_commands_name_it(hidden: str, in
     commands = [command for package in hidden.split(",") for command in COMMANDS[package]]
     folder = inputs / hidden[:40]
     folder.mkdir()
-    paths = [str(SUPPORT / "without_extras"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    done = subprocess.run(
-        [sys.executable, str(SUPPORT / "removed_packages.py"), str(folder), json.dumps(WORKING), json.dumps(commands)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HIDDEN_PACKAGES": hidden},
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
+    arguments = SUPPORT / "removed_packages.py", folder, json.dumps(WORKING), json.dumps(commands)
+    done = run_python(*arguments, environment=environment_without(hidden))
     assert done.returncode == 0, done.stderr
     results = json.loads(done.stdout)
     assert [result for result in results["working"] if result["code"] != 0] == []

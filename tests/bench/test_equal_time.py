@@ -38,18 +38,8 @@ def test_the_rate_of_uniform_mapping_is_measured_and_reused_on_resume(
 ) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-    options = [
-        "--pairs",
-        "home-8-manipulation",
-        "--size",
-        "96x72",
-        "--frames",
-        "4",
-        "--views",
-        "2",
-        "--policies",
-        "task",
-    ]
+    options = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "2"]
+    options += ["--policies", "task"]
     command = ["bench", "quality", "--out", str(tmp_path), *options, "--max-gaussians", "1500", "--threads", "1"]
     assert main([*command, "--equal", "time"]) == 0
     assert "equal time" in capsys.readouterr().err

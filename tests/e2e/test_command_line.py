@@ -80,18 +80,8 @@ def test_eval_prints_lpips_with_a_file_of_it(mug_map: Path, shared_dir: Path) ->
 
 
 def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
-    done = gausslite(
-        "eval",
-        mug_map / "map.ply",
-        HOME,
-        "--size",
-        "160x120",
-        "--test-every",
-        "4",
-        "--set",
-        "target-at=2,2,0.8,0.5",
-        "--json",
-    )
+    options = ("--size", "160x120", "--test-every", "4", "--set", "target-at=2,2,0.8,0.5")
+    done = gausslite("eval", mug_map / "map.ply", HOME, *options, "--json")
     assert done.returncode == 0, done.stderr
     scores = json.loads(done.stdout)
     assert scores["n_views"] == 3

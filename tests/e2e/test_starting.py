@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from other_process import run_python
 
 from gausslite.process import raise_interrupts
 
@@ -70,9 +71,7 @@ FAILURES = {
 def test_a_library_older_than_its_generated_code_gives_one_line(tmp_path: Path, name: str) -> None:
     (tmp_path / "program.py").write_text(FAILURES[name])
     code = "import sys\nfrom gausslite.process import run_program\nsys.exit(run_program('gausslite', 'program'))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, timeout=60, capture_output=True, text=True, check=False
-    )
+    done = run_python("-c", code, cwd=tmp_path)
     [line] = done.stderr.splitlines()
     assert done.returncode == 2
     assert f"pip install --upgrade {name.split()[0]} (" in line
@@ -81,7 +80,7 @@ def test_a_library_older_than_its_generated_code_gives_one_line(tmp_path: Path, 
 def test_compiled_modules_that_are_missing_give_one_line(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text("from gausslite.codec import _not_compiled")
     code = "import sys\nfrom gausslite.process import run_program\nsys.exit(run_program('gausslite', 'program'))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, timeout=60, capture_output=True, text=True)
+    done = run_python("-c", code, cwd=tmp_path)
     [line] = done.stderr.splitlines()
     assert (done.returncode, "install GaussLite again with it" in line, "_not_compiled" in line) == (2, True, True)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from pip_installed import environment_with, install
+from other_process import environment_with, run_python
+from pip_installed import install
 from tiny_sequences import FEW_GAUSSIANS, write_tum
 
 pytest.importorskip("setuptools", reason="the examples are built with setuptools, which is not installed")
@@ -27,10 +27,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def gausslite(installed: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gausslite", *map(str, arguments)],
-        env=environment_with(installed), capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
+    return run_python("-m", "gausslite", *arguments, environment=environment_with(installed), timeout_s=240)
 
 
 def write_red_cup(folder: Path) -> Path:

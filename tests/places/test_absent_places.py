@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from other_process import environment_without, run_python
 from run_folders import write_run
 
 pytest.importorskip("embreex", reason="simulated homes come with the extra sim")
 
-SUPPORT = Path(__file__).resolve().parents[1] / "support"
 _MAIN = "import sys; from gausslite.cli.main import main; sys.exit(main())"
 MISSING = "the package gausslite_places, which is not installed"
 
 
 def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a command of `gausslite` in a process that does not see the package."""
-    paths = [str(SUPPORT / "without_extras"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return subprocess.run(
-        [sys.executable, "-c", _MAIN, *arguments],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HIDDEN_PACKAGES": "gausslite_places"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    return run_python("-c", _MAIN, *arguments, environment=environment_without("gausslite_places"))
 
 
 def test_a_sequence_with_a_drift_is_mapped(tmp_path: Path) -> None:

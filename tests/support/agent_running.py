@@ -1,17 +1,22 @@
-"""An agent and its service in this process, and a relevance estimator that tests can block and break."""
+"""An agent and its service in this process or another, and an estimator that tests can block and break."""
 
 from __future__ import annotations
 
 import asyncio
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import grpc
 import numpy as np
 from fusion_running import GRID
 from serving import serving
+from tiny_yolo import write_tiny_yolo
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import BallRegion, RelevanceMap
@@ -109,3 +114,33 @@ def agent(
             yield Agent(worker, client, pb_grpc.AgentServiceStub(channel))
     finally:
         worker.close()
+
+
+def cup_options(folder: Path) -> list[str]:
+    """Return options of a small mission whose detector finds a cup in every frame."""
+    model = write_tiny_yolo(folder / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
+    return ["--agent-id", "robot", "--detector", str(model), "--max-gaussians", "2000", "--iterations", "1"]
+
+
+@contextmanager
+def agent_process(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], AgentClient]]:
+    """Start an agent in another process, with a socket in the folder; it is killed at the end."""
+    address = f"unix:{folder}/agent.sock"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--set", "threads=1", *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            assert any("listening on" in line for line in process.stderr)
+            with AgentClient(address) as client:
+                yield process, client
+        finally:
+            process.kill()
+
+
+def end(process: subprocess.Popen[str], code: int = 0, number: signal.Signals = signal.SIGTERM) -> str:
+    """Send a signal and wait until the process ends with this code; returns the rest of its log."""
+    assert process.stderr is not None
+    process.send_signal(number)
+    log = process.stderr.read()
+    assert process.wait(60) == code, log
+    return log

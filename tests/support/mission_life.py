@@ -102,25 +102,10 @@ def live(
     """Run a fusion server, an agent and a whole mission; kill: kill and restart the agent in the middle."""
     start_s = time.monotonic()
     fusion_at, agent_at = f"unix:{folder}/fusion.sock", f"unix:{folder}/agent.sock"
-    options = [
-        "--listen",
-        agent_at,
-        "--agent-id",
-        "robot",
-        "--fusion",
-        fusion_at,
-        "--set",
-        "handover=true",
-        *agent_options,
-    ]
-    options += [
-        "--state",
-        f"{folder}/robot.state",
-        "--set",
-        f"spool={folder}/robot.spool",
-        "--set",
-        "save-interval=0.5",
-    ]
+    options = ["--listen", agent_at, "--agent-id", "robot", "--fusion", fusion_at, "--state", f"{folder}/robot.state"]
+    for setting in ("handover=true", f"spool={folder}/robot.spool", "save-interval=0.5"):
+        options += ["--set", setting]
+    options += agent_options
     half = len(frames) // 2
     with ExitStack() as stack:
         stack.enter_context(

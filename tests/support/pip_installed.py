@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,9 +18,3 @@ def install(example: str, folder: Path) -> None:
     command = [*pip, "--no-deps", "--no-build-isolation", "--target", str(folder), str(copied)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def environment_with(folder: Path) -> Mapping[str, str]:
-    """Return the environment of a process that also finds the packages in the folder."""
-    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
@@ -49,17 +50,8 @@ def room(seed: int = 0, texture_seed: int | None = None, mirrored: bool = False)
             low[0] = size[0] - low[0] - extent[0]
         faces += _box(low, extent, paint)
     points, colours = (np.concatenate(parts).astype(np.float32) for parts in zip(*faces, strict=True))
-    n = len(points)
-    return Gaussians(
-        points,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        np.full((n, 3), 0.6 * SPACING_M, np.float32),
-        np.full(n, 0.95, np.float32),
-        colours,
-        np.zeros(n, np.bool_),
-        np.full(n, 7, np.uint32),
-        np.full(n, -1, np.int16),
-    )
+    size_m = 0.6 * SPACING_M
+    return plain_gaussians(points, scales_m=size_m, opacities=0.95, rgb=colours, active=False, kappa=7, target=-1)
 
 
 def looking(x_m: float, y_m: float, yaw_deg: float, z_m: float = 1.6, down_deg: float = 20.0) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from sample_gaussians import uniform_gaussians
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
@@ -35,17 +36,8 @@ def make_batch(seed: int, n: int, grid: VoxelGrid, spread_m: float = 1.0, centre
 def random_subset(agent_id: str, update_seq: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
     """A subset with these numbers of Gaussians, all of one kappa, by voxel key."""
     n = sum(counts.values())
-    numbers = np.random.default_rng(seed).random((n, 14), np.float32)
-    gaussians = Gaussians(
-        numbers[:, :3],
-        numbers[:, 3:7],
-        numbers[:, 7:10],
-        numbers[:, 10],
-        numbers[:, 11:14],
-        np.arange(n) % 2 == 0,
-        np.full(n, kappa, np.uint32),
-        np.full(n, -1, np.int16),
-    )
+    rng = np.random.default_rng(seed)
+    gaussians = uniform_gaussians(rng, n, active=np.arange(n) % 2 == 0, kappa=kappa, target=-1)
     keys = sorted(counts)
     per_voxel = np.array([counts[key] for key in keys], np.uint32)
     batch = VoxelBatch(np.array(keys, np.int64), per_voxel.astype(np.uint64) * np.uint64(kappa), per_voxel, gaussians)

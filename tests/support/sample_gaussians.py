@@ -32,6 +32,13 @@ def plain_gaussians(means_m: Any, **columns: Any) -> Gaussians:
     )
 
 
+def uniform_gaussians(rng: np.random.Generator, n: int, **columns: Any) -> Gaussians:
+    """Gaussians with uniform numbers from 0 to 1 in the columns of floats."""
+    numbers = rng.random((n, 14), np.float32)
+    floats = {"quats_wxyz": numbers[:, 3:7], "scales_m": numbers[:, 7:10], "opacities": numbers[:, 10]}
+    return plain_gaussians(numbers[:, :3], rgb=numbers[:, 11:14], **floats, **columns)
+
+
 def textured_corner(seed: int, kappa: int = 5, count: int = 3000) -> Gaussians:
     """Samples of a textured corner of a room: a floor and two walls of 2 m."""
     rng = np.random.default_rng(seed)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from other_process import run_python
 
 import gausslite as gl
 from gausslite.cli.main import main
@@ -30,7 +29,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
         "import sys, gausslite; dir(gausslite); gausslite.GaussLiteError;"
         "print(*[name for name in ('numpy', 'cv2', 'torch', 'grpc', 'gausslite.api') if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from other_process import environment_with, run_python
 
 pytestmark = pytest.mark.slow
 
@@ -23,23 +23,21 @@ broken = broken_plugin:READER
 
 
 @pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
+def environment(tmp_path: Path) -> Mapping[str, str]:
     """Return the environment of a process that has the distribution of the broken plug-ins."""
     (tmp_path / "broken_plugin-1.dist-info").mkdir()
     (tmp_path / "broken_plugin-1.dist-info" / "METADATA").write_text("Name: broken-plugin\nVersion: 1\n")
     (tmp_path / "broken_plugin-1.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
     (tmp_path / "broken_plugin.py").write_text("raise RuntimeError('no licence')\n")
     (tmp_path / "other_plugin.py").write_text("COMMAND = print\n")
-    paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
+    return environment_with(tmp_path, COLUMNS="200")
 
 
-def run(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "gausslite", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+def run(environment: Mapping[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    return run_python("-m", "gausslite", *arguments, environment=environment)
 
 
-def test_a_broken_plugin_is_one_line_where_it_is_used(environment: dict[str, str], tmp_path: Path) -> None:
+def test_a_broken_plugin_is_one_line_where_it_is_used(environment: Mapping[str, str], tmp_path: Path) -> None:
     listed = run(environment, "--help")
     assert listed.returncode == 0
     assert "map a sequence for a task" in listed.stdout

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import tempfile
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 from few_examples import few_examples
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_gaussians import uniform_gaussians
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import (
@@ -34,21 +35,11 @@ AGENTS = ("ant", "bee", "cat", "dog")
 
 def gaussians_in(cells: list[tuple[int, int]], seed: int) -> Gaussians:
     """Gaussians of these (cell, kappa), each at a random position in the voxel (cell, 0, 0)."""
-    rng = np.random.default_rng(seed)
-    n = len(cells)
-    columns = rng.random((n, 14), np.float32)
-    means = columns[:, :3] * 0.098 + 0.001
-    means[:, 0] += np.array([cell for cell, _ in cells], np.float32) * np.float32(0.1)
-    return Gaussians(
-        means.astype(np.float32),
-        columns[:, 3:7],
-        columns[:, 7:10],
-        columns[:, 10],
-        columns[:, 11:14],
-        np.ones(n, np.bool_),
-        np.array([kappa for _, kappa in cells], np.uint32),
-        np.zeros(n, np.int16),
-    )
+    kappa = [kappa for _, kappa in cells]
+    gaussians = uniform_gaussians(np.random.default_rng(seed), len(cells), kappa=kappa)
+    means_m = gaussians.means_m * 0.098 + 0.001
+    means_m[:, 0] += np.array([cell for cell, _ in cells], np.float32) * np.float32(0.1)
+    return replace(gaussians, means_m=means_m)
 
 
 # Strategies draw plain numbers and the tests build from them: the shape checks that run in our types use random

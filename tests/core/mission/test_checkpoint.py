@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import zlib
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_scenes import wall_frame
+from other_process import run_python
 
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
@@ -103,9 +103,7 @@ def test_a_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_
     changes_of_run(first, 0, CUT)
     save_run(tmp_path / "run.state", first, CONFIG, CUT - 1)
     code = f"import sys; sys.path[:0] = {sys.path!r}; import test_checkpoint; test_checkpoint.resume(sys.argv[1])"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "run.state")], capture_output=True, text=True, timeout=120
-    )
+    done = run_python("-c", code, tmp_path / "run.state")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == checksums(uninterrupted, changes[CUT:])
     assert uninterrupted.state()["mapper/table/kappa"].max() > 0

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from other_process import run_python
 from plugin_entries import register
 
 from gausslite.domain.errors import KernelError, MissingPluginError
@@ -29,7 +28,7 @@ def test_auto_is_cpu_without_gpu_and_does_not_import_torch() -> None:
         "import sys; from gausslite.render.choose import choose_rasterizer; "
         "print(choose_rasterizer(threads=1).name, 'torch' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = run_python("-c", code)
     assert done.stdout.split() == ["cpu", "False"], done.stderr
 
 

@@ -5,10 +5,10 @@ The tests set limits in subprocesses. Sanitizers, which reserve terabytes of add
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import pytest
+from other_process import run_python
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 resource = pytest.importorskip("resource", reason="this system has no resource limits")
@@ -76,9 +76,7 @@ print(CpuRasterizer(2).threads)
 
 
 def run(program: str, *arguments: object) -> list[str]:
-    done = subprocess.run(
-        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run_python("-c", program, *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

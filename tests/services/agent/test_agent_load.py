@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from agent_running import SETTINGS, TASK, Agent, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
+from uplink_running import uplink
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -22,7 +23,6 @@ from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
-from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.settings import LoadSettings
@@ -200,25 +200,20 @@ def test_an_invalid_frame_is_rejected_and_the_stream_continues() -> None:
 
 
 def test_after_a_full_spool_all_changes_are_published_again(tmp_path: Path) -> None:
-    store, spool = SqliteStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
-    with fusion_server(store) as fusion:
-        uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
-        with agent(uplink=uplink) as a:
-            a.client.assign_task(TASK)
-            limit = sqlite3.connect(tmp_path / "robot.spool")
-            limit.execute(
-                "CREATE TRIGGER full BEFORE INSERT ON voxel_updates BEGIN SELECT RAISE(ABORT, 'disk full'); END"
-            )
-            outcomes = list(a.client.ingest([frame(0, CAMERA), frame(1, CAMERA)]))
-            assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 2
-            assert any("disk full" in note for note in a.client.status().notes)
-            limit.execute("DROP TRIGGER full")
-            limit.close()
-            list(a.client.ingest([frame(2, CAMERA)]))
-            assert not any("disk full" in note for note in a.client.status().notes)
-            assert uplink.drain(20.0)
-            active = a.worker.run(lambda mapper: mapper.gaussians(active_only=True)).result()
-        uplink.close()
+    store, path = SqliteStore(), tmp_path / "robot.spool"
+    with fusion_server(store) as fusion, uplink(fusion.client.address, spool=path) as link, agent(uplink=link) as a:
+        a.client.assign_task(TASK)
+        limit = sqlite3.connect(path)
+        limit.execute("CREATE TRIGGER full BEFORE INSERT ON voxel_updates BEGIN SELECT RAISE(ABORT, 'disk full'); END")
+        outcomes = list(a.client.ingest([frame(0, CAMERA), frame(1, CAMERA)]))
+        assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 2
+        assert any("disk full" in note for note in a.client.status().notes)
+        limit.execute("DROP TRIGGER full")
+        limit.close()
+        list(a.client.ingest([frame(2, CAMERA)]))
+        assert not any("disk full" in note for note in a.client.status().notes)
+        assert link.drain(20.0)
+        active = a.worker.run(lambda mapper: mapper.gaussians(active_only=True)).result()
     assert int(store.batches()["robot"].counts.sum()) == len(active) > 0
 
 

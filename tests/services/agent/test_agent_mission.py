@@ -5,21 +5,20 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import grpc
 import numpy as np
 import pytest
+from agent_running import agent_process, cup_options, end
 from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server
 from plugin_entries import register
 from signals import hangup
-from tiny_yolo import write_tiny_yolo
+from uplink_running import uplink
 
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.source import Source
@@ -36,12 +35,8 @@ from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.plugins import Group
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
-from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.run_service import run_service
 from gausslite.wire.server import serve_until_stopped
-from gausslite.wire.spool import Spool
-from gausslite.wire.update_sender import UplinkSettings
-from gausslite.wire.uplink import Uplink
 from gausslite_agent.keyframe_upload import open_upload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
@@ -99,23 +94,16 @@ def settings(out: Path | None, *more: str) -> AgentSettings:
 
 @contextmanager
 def agent_mission(options: AgentSettings, address: str | None = None) -> Iterator[tuple[AgentMission, MappingWorker]]:
-    client = None if address is None else FusionClient(address)
-    uplink = None
-    if client is not None:
-        uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
-    link = options.link
-    keyframes = None
-    if uplink is not None:
-        keyframes = open_upload(uplink, GRID, link.keyframes, link.keyframes_during_mission)
-    worker = MappingWorker(
-        options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink, keyframe_upload=keyframes
-    )
-    try:
-        yield AgentMission(options, worker, RuleParser()), worker
-    finally:
-        worker.close()
-        if uplink is not None:
-            uplink.close()
+    with nullcontext() if address is None else uplink(address) as link:
+        limits = options.link.keyframes, options.link.keyframes_during_mission
+        keyframes = None if link is None else open_upload(link, GRID, *limits)
+        worker = MappingWorker(
+            options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), link, keyframe_upload=keyframes
+        )
+        try:
+            yield AgentMission(options, worker, RuleParser()), worker
+        finally:
+            worker.close()
 
 
 def stream_of(wall: Wall, options: AgentSettings) -> FrameStream:
@@ -284,38 +272,28 @@ def test_two_agents_cannot_write_into_one_folder(tmp_path: Path, capsys: pytest.
 
 
 def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> None:
-    address = f"unix:{tmp_path}/agent.sock"
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--parser", "127.0.0.1:1"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
-        assert p.stderr is not None
-        assert any("listening on" in line for line in p.stderr)
+    with agent_process(tmp_path, "--parser", "127.0.0.1:1") as (process, client):
         # a plain stub, since the client would try again
-        with grpc.insecure_channel(address) as channel, pytest.raises(grpc.RpcError, match=r"parser 127\.0\.0\.1:1: "):
+        with (
+            grpc.insecure_channel(client.address) as channel,
+            pytest.raises(grpc.RpcError, match=r"parser 127\.0\.0\.1:1: "),
+        ):
             AgentServiceStub(channel).AssignTask(AssignTaskRequest(text="Pick up the cup"), timeout=20.0)
-        p.send_signal(signal.SIGTERM)
-        assert p.wait(30) == 0
+        end(process)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=hangup)])
 def test_received_frames_give_a_map_and_a_report_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
-    model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
-    address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--set", "threads=1"]
-    command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
-        assert p.stderr is not None
-        assert any("listening on" in line for line in p.stderr)
-        with AgentClient(address) as client:
-            client.assign_task("Pick up the cup")
-            outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
-        p.send_signal(number)
-        stderr_text = p.stderr.read()
-        assert p.wait(30) == 0, stderr_text
+    out, options = tmp_path / "out", cup_options(tmp_path)
+    with agent_process(tmp_path, *options, "--out", str(out), "--task", "Pick up the cup") as (process, client):
+        client.assign_task("Pick up the cup")
+        outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
+        log = end(process, number=number)
     report = json.loads((out / "report.json").read_text())
     assert [outcome.outcome for outcome in outcomes] == [FRAME_OUTCOME_MAPPED] * 2
     assert report["frames"] == 2
     assert len(read_ply(out / "map.ply")) == report["gaussians"] > 0
-    assert "ended" in stderr_text
+    assert "ended" in log
 
 
 def test_without_a_mapped_frame_nothing_is_overwritten(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from agent_running import TASK, Agent, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
+from uplink_running import uplink
 from waiting import wait_until
 
 from gausslite.domain.camera import Camera, CameraMotion
@@ -40,10 +41,6 @@ from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire import convert, convert_task
-from gausslite.wire.clients import FusionClient
-from gausslite.wire.spool import Spool
-from gausslite.wire.update_sender import UplinkSettings
-from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.servicer import MapChangeLog, NewestTask
 from gausslite_language.rules import RuleParser
@@ -472,18 +469,12 @@ def test_an_upside_down_region_is_refused(robot: Agent) -> None:
 
 def test_only_the_tasks_region_leaves_the_robot() -> None:
     store = SqliteStore()
-    with fusion_server(store) as fusion:
-        client = FusionClient(fusion.client.address)
-        uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
-        try:
-            with agent(uplink=uplink) as a:
-                a.client.assign_task(TASK)
-                list(a.client.ingest([frame(index) for index in range(3)]))
-                assert uplink.drain(20.0)
-                status = a.client.status()
-                gaussians = a.worker.run(lambda mapper: mapper.gaussians()).result(20)
-        finally:
-            uplink.close()
+    with fusion_server(store) as fusion, uplink(fusion.client.address) as link, agent(uplink=link) as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(index) for index in range(3)]))
+        assert link.drain(20.0)
+        status = a.client.status()
+        gaussians = a.worker.run(lambda mapper: mapper.gaussians()).result(20)
     stored = store.batch("robot")
     assert stored.gaussians.active.all()
     assert len(stored.gaussians) == gaussians.active.sum() < len(gaussians)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,10 +10,10 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from agent_running import agent_process, cup_options, end
 from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, red_frame
 from jaxtyping import Float32
 from numpy import ndarray
-from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import read_state, write_state
@@ -29,7 +26,7 @@ from gausslite.domain.state import State
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, group_by_voxel
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate
-from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
@@ -298,46 +295,26 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
 
 
 @pytest.mark.slow
-def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
-    model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
-    address, store = f"unix:{tmp_path}/agent.sock", SqliteStore()
-    command = [
-        sys.executable,
-        "-m",
-        "gausslite_agent",
-        "--listen",
-        address,
-        "--out",
-        str(tmp_path),
-        "--set",
-        "threads=1",
-    ]
-    command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
-    command += ["--state", str(tmp_path / "a.state"), "--set", f"spool={tmp_path / 'a.spool'}", "--agent-id", "robot"]
+def test_a_real_agent_resumes_its_mission(fusion: RunningServer, tmp_path: Path) -> None:
+    options = [*cup_options(tmp_path), "--task", "Pick up the cup", "--out", str(tmp_path)]
+    options += ["--state", str(tmp_path / "a.state"), "--set", f"spool={tmp_path / 'a.spool'}"]
+    options += ["--fusion", fusion.client.address]
     kappas, revisions = [], []
-    with fusion_server(store) as fusion:
-        for indices in (range(3), range(3, 6)):
-            with subprocess.Popen(
-                [*command, "--fusion", fusion.client.address], stderr=subprocess.PIPE, text=True
-            ) as p:
-                assert p.stderr is not None
-                assert any("listening on" in line for line in p.stderr)
-                with AgentClient(address) as client:
-                    if indices.start == 0:
-                        client.assign_task("Pick up the cup")
-                    revisions.append(client.status().map_revision)
-                    list(client.ingest([red_frame(i) for i in indices], lossless=True))
-                    revisions.append(client.status().map_revision)
-                p.send_signal(signal.SIGTERM)
-                stderr_text = p.stderr.read()
-                assert p.wait(30) == 0, stderr_text
-            kappas.append(int(read_ply(tmp_path / "map.ply").kappa.sum()))
-        [agent] = fusion.client.status().agents
-    assert "after frame 2" in stderr_text
+    for indices in (range(3), range(3, 6)):
+        with agent_process(tmp_path, *options) as (process, client):
+            if indices.start == 0:
+                client.assign_task("Pick up the cup")
+            revisions.append(client.status().map_revision)
+            list(client.ingest([red_frame(i) for i in indices], lossless=True))
+            revisions.append(client.status().map_revision)
+            log = end(process)
+        kappas.append(int(read_ply(tmp_path / "map.ply").kappa.sum()))
+    [agent] = fusion.client.status().agents
+    assert "after frame 2" in log
     assert 0 < kappas[0] < kappas[1]
     assert revisions == sorted(set(revisions))
     assert agent.gaussians > 0
-    fixed_settings = parse_arguments([*command[3:], "--fusion", "localhost:1"]).fixed_settings
+    fixed_settings = parse_arguments([*options, "--set", "threads=1"]).fixed_settings
     assert SavedMission.read(tmp_path / "a.state", *fixed_settings).checkpoint == MissionCheckpoint(
         5, RuleParser().parse("Pick up the cup"), "Pick up the cup", revisions[-1]
     )

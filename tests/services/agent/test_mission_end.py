@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 import re
-import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from agent_running import TASK, agent
-from fusion_running import GRID, RunningServer, frame, red_frame
-from tiny_yolo import write_tiny_yolo
+from agent_running import TASK, agent, agent_process, cup_options, end
+from fusion_running import RunningServer, frame, red_frame
+from uplink_running import uplink
 from waiting import wait_until
 
 from gausslite.codec.ply import read_ply
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.relevance import PointedObject
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.spool import Spool
-from gausslite.wire.update_sender import UplinkSettings
+from gausslite.wire.clients import AgentClient
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.state import EndRequest, MissionState, MissionStateMachine
-
-
-@contextmanager
-def linked(address: str) -> Iterator[Uplink]:
-    link = Uplink(FusionClient(address), "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))
-    try:
-        yield link
-    finally:
-        link.close()
 
 
 def state_name(client: AgentClient) -> str:
@@ -42,7 +28,7 @@ def state_name(client: AgentClient) -> str:
 
 
 def test_end_mission_drains_and_a_task_begins_the_next_mission(fusion: RunningServer) -> None:
-    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+    with uplink(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         assert state_name(a.client) == "WAITING_FOR_TASK"
         with pytest.raises(MismatchError, match="call AssignTask"):
             a.client.end_mission()
@@ -66,7 +52,7 @@ def test_end_mission_drains_and_a_task_begins_the_next_mission(fusion: RunningSe
 
 
 def test_a_handover_on_request_brings_the_whole_map_and_the_keyframes(fusion: RunningServer) -> None:
-    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+    with uplink(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(index) for index in range(6)]))
         response = a.client.end_mission(handover=True)
@@ -78,7 +64,7 @@ def test_a_handover_on_request_brings_the_whole_map_and_the_keyframes(fusion: Ru
 
 
 def test_an_unreachable_server_leaves_data_and_the_summary_says_how_much() -> None:
-    with linked("127.0.0.1:1") as link, agent(uplink=link, queue_frames=100) as a:
+    with uplink("127.0.0.1:1") as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))
         response = a.client.end_mission(handover=True, drain_s=0.1)
@@ -95,7 +81,7 @@ def test_an_impossible_drain_time_is_refused(drain_s: float) -> None:
 
 def test_two_callers_get_the_result_of_one_end(fusion: RunningServer) -> None:
     answers: list[pb.EndMissionResponse] = []
-    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+    with uplink(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))
         threads = [threading.Thread(target=lambda: answers.append(a.client.end_mission())) for _ in range(2)]
@@ -112,7 +98,7 @@ def test_calls_that_wait_for_the_end_leave_threads_to_others(
 ) -> None:
     drained = threading.Event()
     monkeypatch.setattr(Uplink, "drain", lambda *_: drained.wait(60))
-    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+    with uplink(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))
         # more than asyncio's own threads
@@ -136,44 +122,13 @@ def test_a_phase_that_cannot_follow_is_refused() -> None:
     assert phases.failure == ""
 
 
-@contextmanager
-def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subprocess.Popen[str], AgentClient]]:
-    """Start an agent whose detector finds a cup in every frame."""
-    model = write_tiny_yolo(folder / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
-    address = f"unix:{folder}/agent.sock"
-    command = [
-        sys.executable,
-        "-m",
-        "gausslite_agent",
-        "--listen",
-        address,
-        "--set",
-        "threads=1",
-        "--agent-id",
-        "robot",
-    ]
-    command += ["--detector", str(model), "--max-gaussians", "2000", "--iterations", "1", "--set", "queue=100"]
-    command += ["--fusion", fusion, *more]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        try:
-            assert any("listening on" in line for line in process.stderr)
-            with AgentClient(address) as client:
-                yield process, client
-        finally:
-            process.kill()
-
-
 @pytest.mark.slow
 def test_sigterm_hands_over_within_the_grace_period(fusion: RunningServer, tmp_path: Path) -> None:
-    options = ("--set", "handover=true", "--set", "grace-period=60", "--out", str(tmp_path))
-    with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
+    options = (*cup_options(tmp_path), "--set", "queue=100", "--fusion", fusion.client.address, "--out", str(tmp_path))
+    with agent_process(tmp_path, *options, "--set", "handover=true", "--set", "grace-period=60") as (process, client):
         client.assign_task("Pick up the cup")
         list(client.ingest([red_frame(index) for index in range(12)]))
-        process.send_signal(signal.SIGTERM)
-        assert process.stderr is not None
-        log = process.stderr.read()
-        assert process.wait(60) == 0
+        log = end(process)
     [stored] = fusion.client.status().agents
     assert "mission ended early (interrupted): 12 frames" in log
     assert "nothing was left" in log
@@ -185,16 +140,14 @@ def test_sigterm_hands_over_within_the_grace_period(fusion: RunningServer, tmp_p
 @pytest.mark.slow
 def test_what_sigterm_leaves_is_sent_after_the_next_start(fusion: RunningServer, tmp_path: Path) -> None:
     options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(tmp_path / "x.state"), "--set", "handover=true")
-    with agent_process(tmp_path, "127.0.0.1:1", *options, "--set", "grace-period=0.1") as (process, client):
+    options += (*cup_options(tmp_path), "--set", "queue=100", "--set", "grace-period=0.1")
+    with agent_process(tmp_path, *options, "--fusion", "127.0.0.1:1") as (process, client):
         client.assign_task("Pick up the cup")
         list(client.ingest([red_frame(index) for index in range(6)]))
-        process.send_signal(signal.SIGTERM)
-        assert process.stderr is not None
-        log = process.stderr.read()
-        assert process.wait(60) == 0
+        log = end(process)
     assert "and 6 keyframes, in " in log
     assert "until the agent runs again" in log
-    with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
+    with agent_process(tmp_path, *options, "--fusion", fusion.client.address) as (_, client):
         ended = client.end_mission()
     [stored] = fusion.client.status().agents
     assert (ended.voxels_waiting, ended.keyframes_waiting) == (0, 0)
@@ -204,13 +157,11 @@ def test_what_sigterm_leaves_is_sent_after_the_next_start(fusion: RunningServer,
 
 @pytest.mark.slow
 def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> None:
-    with agent_process(tmp_path, "127.0.0.1:1", "--set", "grace-period=0.1") as (process, client):
+    options = ("--set", "queue=100", "--set", "grace-period=0.1", "--fusion", "127.0.0.1:1")
+    with agent_process(tmp_path, *cup_options(tmp_path), *options) as (process, client):
         client.assign_task("Pick up the cup")
         list(client.ingest([red_frame(index) for index in range(6)]))
-        process.send_signal(signal.SIGTERM)
-        assert process.stderr is not None
-        log = process.stderr.read().splitlines()
-        assert process.wait(60) == 1
+        log = end(process, code=1).splitlines()
     (line,) = [line for line in log if " ERROR " in line]
     assert re.search(r"lost [1-9]\d* voxels and 0 keyframes that were not sent; --set spool=FILE keeps them", line)
 
@@ -219,7 +170,8 @@ def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> 
 def test_a_killed_agent_continues_from_its_last_save(fusion: RunningServer, tmp_path: Path) -> None:
     state = tmp_path / "x.state"
     options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(state), "--set", "save-interval=0.05")
-    with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
+    options += (*cup_options(tmp_path), "--set", "queue=100", "--fusion", fusion.client.address)
+    with agent_process(tmp_path, *options) as (process, client):
         client.assign_task("Pick up the cup")
         # the first save may be one before the first frame; a different one is of a map
         saves_ns: set[int] = set()
@@ -231,7 +183,7 @@ def test_a_killed_agent_continues_from_its_last_save(fusion: RunningServer, tmp_
                 break
         mapped = client.status().map_revision
         process.kill()
-    with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
+    with agent_process(tmp_path, *options) as (_, client):
         status = client.status()
         assert status.graph.text == "Pick up the cup"
         assert state_name(client) == "MAPPING"
@@ -260,16 +212,10 @@ def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp
 @pytest.mark.slow
 def test_an_agent_with_a_page_takes_a_task_without_a_detector(tmp_path: Path) -> None:
     pytest.importorskip("viser")
-    address = f"unix:{tmp_path}/agent.sock"
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--set", "threads=1", "--set", "view=0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        assert any("listening on" in line for line in process.stderr)
-        with AgentClient(address) as client:
-            assert client.assign_task(TASK).warnings[0] == "nothing searches 'mug': there is no detector"
-            [answer] = client.ingest([red_frame(0)])
-            client.assign_task(pointed=[PointedObject(points_px=((16.0, 12.0),), noun="mug")])
-            [pointed_at] = client.ingest([red_frame(1)])
-        process.terminate()
-        assert process.wait(30) == 0
+    with agent_process(tmp_path, "--set", "view=0") as (process, client):
+        assert client.assign_task(TASK).warnings[0] == "nothing searches 'mug': there is no detector"
+        [answer] = client.ingest([red_frame(0)])
+        client.assign_task(pointed=[PointedObject(points_px=((16.0, 12.0),), noun="mug")])
+        [pointed_at] = client.ingest([red_frame(1)])
+        end(process)
     assert (answer.roi_share, pointed_at.roi_share > 0) == (0, True)

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -86,10 +85,8 @@ def test_a_real_agent_that_waits_for_its_parser_ends_on_sigterm(tmp_path: Path) 
             assert process.stderr is not None
             while "retrying" not in process.stderr.readline():
                 pass
-            start_s = time.monotonic()
             process.send_signal(signal.SIGTERM)
             assert process.wait(20) == 2
-            assert time.monotonic() - start_s < 15
             assert "refused" in process.stderr.read().lower()
         finally:
             process.kill()

@@ -7,47 +7,40 @@ from pathlib import Path
 
 import pytest
 from agent_running import TASK, Agent, agent
-from fusion_running import GRID, RunningServer, frame, fusion_server
+from fusion_running import RunningServer, frame
+from uplink_running import uplink
 
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply
 from gausslite.domain.relevance import BallRegion
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator
-from gausslite.wire.clients import FusionClient
-from gausslite.wire.spool import Spool
-from gausslite.wire.update_sender import UplinkSettings
-from gausslite.wire.uplink import Uplink
 
 
-def test_a_team_is_watched_ended_refined_and_fetched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with fusion_server() as fusion:
-        server = fusion.client.address
-        spool = Spool(None, "robot", GRID)
-        link = Uplink(FusionClient(server), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
-        try:
-            with agent(uplink=link) as a:
-                robot = a.client.address
-                assert main(["status", robot]) == 0
-                assert capsys.readouterr().out.startswith("agent robot: waiting for task\n")
-                a.client.assign_task(TASK)
-                list(a.client.ingest([frame(0)]))
-                assert main(["status", robot, "--json"]) == 0
-                assert json.loads(capsys.readouterr().out)["frames_mapped"] == "1"
-                assert main(["end", robot, "--handover"]) == 0
-                assert capsys.readouterr().out.strip().endswith("nothing was left")
-        finally:
-            link.close()
-        assert main(["status", server]) == 0
-        out = capsys.readouterr().out
-        assert "keyframes  1; not refined yet" in out
-        assert "robot      absent" in out
-        refined, voted = tmp_path / "refined.ply", tmp_path / "voted.ply"
-        assert main(["refine", server, "--iterations", "2", "--out", str(refined)]) == 0
-        assert main(["fetch", server, "--out", str(voted)]) == 0
-        assert main(["fetch", server, "--strategy", "refined", "--out", str(tmp_path / "again.ply")]) == 0
-        assert len(read_ply(refined)) == len(read_ply(tmp_path / "again.ply")) > 0
-        assert len(read_ply(voted)) > 0
+def test_a_team_is_watched_ended_refined_and_fetched(
+    fusion: RunningServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server = fusion.client.address
+    with uplink(server) as link, agent(uplink=link) as a:
+        robot = a.client.address
+        assert main(["status", robot]) == 0
+        assert capsys.readouterr().out.startswith("agent robot: waiting for task\n")
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(0)]))
+        assert main(["status", robot, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["frames_mapped"] == "1"
+        assert main(["end", robot, "--handover"]) == 0
+        assert capsys.readouterr().out.strip().endswith("nothing was left")
+    assert main(["status", server]) == 0
+    out = capsys.readouterr().out
+    assert "keyframes  1; not refined yet" in out
+    assert "robot      absent" in out
+    refined, voted = tmp_path / "refined.ply", tmp_path / "voted.ply"
+    assert main(["refine", server, "--iterations", "2", "--out", str(refined)]) == 0
+    assert main(["fetch", server, "--out", str(voted)]) == 0
+    assert main(["fetch", server, "--strategy", "refined", "--out", str(tmp_path / "again.ply")]) == 0
+    assert len(read_ply(refined)) == len(read_ply(tmp_path / "again.ply")) > 0
+    assert len(read_ply(voted)) > 0
 
 
 def test_the_status_of_an_agent_that_has_not_found_its_task_exits_with_3() -> None:

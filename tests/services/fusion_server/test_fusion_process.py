@@ -98,11 +98,8 @@ def test_a_database_without_the_extra_is_one_line_with_the_command_that_installs
 def without(*packages: str) -> list[str]:
     """The command of a server where these packages are not installed."""
     absent = "".join(f"sys.modules[{name!r}] = None; " for name in packages)
-    return [
-        sys.executable,
-        "-c",
-        f"import sys; {absent}from gausslite_fusion_server.program import run; sys.exit(run())",
-    ]
+    program = f"import sys; {absent}from gausslite_fusion_server.program import run; sys.exit(run())"
+    return [sys.executable, "-c", program]
 
 
 def test_without_its_plug_ins_a_server_stores_and_votes_and_says_once_that_it_compares_no_frames(

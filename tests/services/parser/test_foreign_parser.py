@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from other_process import environment_with, run_python
 
 from gausslite.wire.clients import ParserClient
 from gausslite_agent.program import WaitingParser
@@ -34,18 +35,17 @@ class FixedBackend:
 
 
 @pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
+def environment(tmp_path: Path) -> Mapping[str, str]:
     """Return the environment of a process in which the distribution is installed."""
     metadata = tmp_path / "fixed_parser-1.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: fixed-parser\nVersion: 1\n")
     (metadata / "entry_points.txt").write_text("[gausslite.parsers]\nfixed = fixed_parser:FixedBackend\n")
     (tmp_path / "fixed_parser.py").write_text(MODULE)
-    path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "PYTHONPATH": path}
+    return environment_with(tmp_path)
 
 
-def test_a_parser_of_another_distribution_is_chosen_by_its_name(tmp_path: Path, environment: dict[str, str]) -> None:
+def test_a_parser_of_another_distribution_is_chosen_by_its_name(tmp_path: Path, environment: Mapping[str, str]) -> None:
     listen = f"unix:{tmp_path}/parser.sock"
     options = ("--backend", "fixed", "--fixed-noun", "cup")
     command = [sys.executable, "-m", "gausslite_parser", "--listen", listen, *options]
@@ -56,8 +56,7 @@ def test_a_parser_of_another_distribution_is_chosen_by_its_name(tmp_path: Path, 
             process.terminate()
 
 
-def test_an_option_of_another_parser_is_refused(environment: dict[str, str]) -> None:
-    command = [sys.executable, "-m", "gausslite_parser", "--fixed-noun", "cup"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+def test_an_option_of_another_parser_is_refused(environment: Mapping[str, str]) -> None:
+    done = run_python("-m", "gausslite_parser", "--fixed-noun", "cup", environment=environment)
     assert done.returncode == 2
     assert "--fixed-noun: has an effect only with --backend fixed" in done.stderr

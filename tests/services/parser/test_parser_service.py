@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 from pathlib import Path
 
 import grpc
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from other_process import run_python
 from serving import serving
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, TaskError, UnavailableError
@@ -82,10 +81,7 @@ def test_an_address_in_use_is_one_line_and_code_2() -> None:
     with serving([parser_service(RuleParser())], "127.0.0.1:0") as server:
         with pytest.raises(UnavailableError, match="in use"):
             asyncio.run(start_server(server.address, []))
-        ended = subprocess.run(
-            [sys.executable, "-m", "gausslite_parser", "--listen", server.address],
-            capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
+        ended = run_python("-m", "gausslite_parser", "--listen", server.address)
     assert ended.returncode == 2
     assert ended.stdout == ""
     assert len(ended.stderr.splitlines()) == 1
@@ -108,8 +104,7 @@ def test_an_impossible_socket_is_one_line_and_code_2(tmp_path: Path) -> None:
     }
     for reason, paths in sockets.items():
         for path in paths:
-            command = [sys.executable, "-m", "gausslite_parser", "--listen", f"unix:{path}"]
-            ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+            ended = run_python("-m", "gausslite_parser", "--listen", f"unix:{path}")
             assert ended.returncode == 2
             [line] = ended.stderr.splitlines()
             assert reason in line
