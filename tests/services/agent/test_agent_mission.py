@@ -296,8 +296,15 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
         assert p.wait(30) == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=hangup)])
-def test_received_frames_give_a_map_and_a_report_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (signal.SIGTERM,),
+        pytest.param((signal.SIGHUP,), marks=hangup),
+        pytest.param((signal.SIGINT, signal.SIGINT, signal.SIGTERM), id="a launcher"),
+    ],
+)
+def test_received_frames_give_a_map_and_a_report_on_signals(tmp_path: Path, numbers: tuple[signal.Signals]) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
     address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
     command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--set", "threads=1"]
@@ -308,7 +315,8 @@ def test_received_frames_give_a_map_and_a_report_on_a_signal(tmp_path: Path, num
         with AgentClient(address) as client:
             client.assign_task("Pick up the cup")
             outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
-        p.send_signal(number)
+        for number in numbers:
+            p.send_signal(number)
         stderr_text = p.stderr.read()
         assert p.wait(30) == 0, stderr_text
     report = json.loads((out / "report.json").read_text())
