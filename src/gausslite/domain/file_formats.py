@@ -31,12 +31,11 @@ FOREIGN_BYTES: Final = 512
 
 def foreign_format(start: bytes) -> str:
     """Return what a file is by its first FOREIGN_BYTES, for messages; empty for an unknown format."""
-    trimmed, none = start.lstrip().lower(), "" if start else "an empty file"
+    trimmed = start.lstrip().lower()
     if start[257:262] == b"ustar":
         return "a tar archive; unpack it first"
-    return next(
-        (name for magic, name in _FOREIGN_FORMATS if start.startswith(magic) or trimmed.startswith(magic)), none
-    )
+    named = (name for magic, name in _FOREIGN_FORMATS if start.startswith(magic) or trimmed.startswith(magic))
+    return next(named, "" if start else "an empty file")
 
 
 def foreign_file(path: Path) -> str:
