@@ -1,11 +1,12 @@
-"""Build GaussLite by scikit-build-core: in the source's build folder if that can be written, else in a temporary one.
+"""Build GaussLite by scikit-build-core: in the source's build folder if that can be written, else in the user's cache.
 
-Root's clones and read-only mounts can be installed so; elsewhere the build folder lets a second installation skip the
-kernels' compilation.
+Root's clones and read-only mounts can be installed so. The folder lets a second installation skip the kernels'
+compilation.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Callable
@@ -40,8 +41,15 @@ def _build(
     settings = dict(config_settings or {})
     if "build-dir" in settings or _can_build_here():
         return of_kind(wheel_directory, settings, metadata_directory)
-    with tempfile.TemporaryDirectory(prefix="gausslite-build-") as folder:
-        return of_kind(wheel_directory, {**settings, "build-dir": folder}, metadata_directory)
+    # CMake refuses the folder of a source at another place
+    source = hashlib.sha256(os.fsencode(Path.cwd())).hexdigest()[:16]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "gausslite" / source
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        with tempfile.TemporaryDirectory(prefix="gausslite-build-") as folder:
+            return of_kind(wheel_directory, {**settings, "build-dir": folder}, metadata_directory)
+    return of_kind(wheel_directory, {**settings, "build-dir": f"{cache}/{{wheel_tag}}"}, metadata_directory)
 
 
 build_wheel = partial(_build, build.build_wheel)

@@ -102,8 +102,9 @@ class ClassMatchSettings:
 
 
 def class_nouns(name: str) -> tuple[str, ...]:
-    """Return the nouns that a class name states: "Drill (Tool)" is a drill, "sofa/couch" a sofa and a couch."""
-    return tuple(dict.fromkeys(normalised_noun(part.partition(" (")[0]) for part in _SEPARATORS.split(name) if part))
+    """Return the nouns that a class name states: "drill_(tool)" is a drill, "sofa/couch" a sofa and a couch."""
+    parts = _SEPARATORS.split(name.replace("_", " "))
+    return tuple(dict.fromkeys(normalised_noun(part.partition(" (")[0]) for part in parts if part))
 
 
 def match_noun(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +23,7 @@ COCO_NAMES: Final = tuple(" ".join(name.split()) for name in _COCO.split(","))
 _COCO_GAPS: Final = frozenset({12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
 _COCO_BY_ID: Final = dict(zip((i for i in range(1, 91) if i not in _COCO_GAPS), COCO_NAMES, strict=True))
 _KEYS: Final = ("names", "class_names", "classes", "labels")
+_INDEXED: Final = re.compile(r"(\d+)\s*[:=]\s*(.+)")
 _NOTES: Final = "rfdetr_notes"
 """The field in which `export(notes=...)` of rfdetr stores a text or JSON."""
 
@@ -82,7 +84,7 @@ def names_of(stated: Mapping[int, str], classes: int) -> tuple[str, ...]:
 
 
 def _parsed(text: str) -> Any:
-    """Return the value of JSON or of a Python literal; words separated by lines or commas as a list."""
+    """Return the value of JSON or of a Python literal; words separated by lines or commas, `0: mug` by its index."""
     for parse in (json.loads, ast.literal_eval):
         try:
             return parse(text)
@@ -91,7 +93,9 @@ def _parsed(text: str) -> Any:
     if text.startswith(("{", "[", "(")):
         return None
     words = text.splitlines() if "\n" in text else text.replace(";", ",").split(",")
-    return [word.strip() for word in words if word.strip()]
+    words = [word.strip() for word in words if word.strip()]
+    indexed = [_INDEXED.fullmatch(word) for word in words]
+    return dict(entry.groups() for entry in indexed if entry) if all(indexed) else words
 
 
 def _names_in(value: Any) -> dict[int, str]:

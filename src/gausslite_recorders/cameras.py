@@ -97,7 +97,9 @@ def read_open3d(path: Path, _width_px: int, _height_px: int) -> FolderCamera | N
         fx, _, _, _, fy, _, cx, cy, _ = map(float, fields["intrinsic_matrix"])
         width, height = int(fields["width"]), int(fields["height"])
     except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: expected width, height and an intrinsic_matrix of 9 numbers; {error!r}") from None
+        raise DatasetError(
+            f"{path}: expected width, height and an intrinsic_matrix of 9 numbers with decimal points; {error!r}"
+        ) from None
     return FolderCamera(FileIntrinsics(fx, fy, cx, cy).camera(str(path), width, height))
 
 

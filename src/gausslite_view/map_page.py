@@ -191,18 +191,21 @@ class TaskField:
     """Owns the field and the button with which a person assigns a task. assign: it may raise GaussLiteError."""
 
     def __init__(self, gui: viser.GuiApi, assign: Callable[[str], TaskGraph], task: str = "") -> None:
-        self._assign = assign
+        self._assign, self._current = assign, task
         self.text: Any = gui.add_text("Task", task)
         button = gui.add_button("Assign task")
         self._message = gui.add_html("")
-        button.on_click(lambda _: self._press())
+        button.on_click(lambda _: self.press())
 
-    def _press(self) -> None:
+    def press(self) -> None:
         """Assign the sentence, on a thread of the page's server, and show the targets or the error."""
         self._message.content = text_html(["the mission answers after its current frame"])
         try:
             graph = self._assign(str(self.text.value))
             lines = [f"assigned: targets {', '.join(graph.targets)}", *graph.warnings]
+            if graph.warnings and self._current:
+                lines.append(f"it replaces the task: {self._current}")
+            self._current = graph.text
         except GaussLiteError as error:
             lines = [str(error)]
         self._message.content = text_html(lines)

@@ -126,6 +126,8 @@ VARIANTS = {
     "names-inverted": ({"output0": raw()}, {"names": "{'cup': 0, 'chair': 1, 'table': 2}"}, None),
     "names-words": ({"output0": raw()}, {"names": "cup, chair, table"}, None),
     "names-lines": ({"output0": raw()}, {"classes": "cup\nchair\ntable\n"}, None),
+    "names-yaml": ({"output0": raw()}, {"names": "0: cup\n1: chair\n2: table\n"}, None),
+    "names-lvis": ({"output0": raw()}, {"names": "['cup_(drink)', 'chair', 'table']"}, None),
     "names-several": ({"output0": raw()}, {"names": "['mug/cup', 'chair', 'table']"}, None),
     "names-several-commas": ({"output0": raw()}, {"names": "['Mug, cup', 'chair', 'table']"}, None),
 }  # fmt: skip

@@ -30,6 +30,7 @@ from gausslite_language.rules import RuleParser
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 pytest.importorskip("viser")
+from gausslite_view.map_page import TaskField
 from gausslite_view.mission_view import MissionRequests, MissionView, mission_view
 from gausslite_view.pages import open_page
 
@@ -227,3 +228,13 @@ def test_the_current_task_stands_on_the_page_also_while_the_field_has_another() 
         view.update(searched.process(wall_frame()))
         assert "task: Find the lamp" in text(page)
         view.end()
+
+
+def test_a_task_that_may_not_be_found_names_the_one_that_it_replaces() -> None:
+    searched = mission()
+    with closing(open_page(0, "test")) as page:
+        field = TaskField(page.server.gui, lambda task: searched.assign(RuleParser().parse(task)), "Find the mug")
+        for task, replaced in (("Find the lamp", "Find the mug"), ("asdf", ""), ("Find the vase", "Find the lamp")):
+            field.text.value = task
+            field.press()
+            assert (f"it replaces the task: {replaced}" in text(page)) is bool(replaced)

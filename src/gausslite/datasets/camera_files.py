@@ -135,7 +135,7 @@ def read_json_camera(path: Path) -> FolderCamera:
         numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
         lens = lens_of(str(path), fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
+        expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with decimal points'
         raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
     if not (np.isfinite(numbers["scale"]) and numbers["scale"] >= _MIN_UNITS_PER_METRE):
         expected = "depth units per metre, such as 1000 for millimetres"

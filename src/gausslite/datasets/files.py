@@ -185,8 +185,7 @@ def decode_image(location: str, data: bytes, flags: int) -> NDArray[Any]:
     """
     if not data.startswith((_PNG_MAGIC, _JPEG_MAGIC)):
         other = foreign_format(data[:FOREIGN_BYTES]) or f"another format, which begins with {data[:16]!r}"
-        got = other if data else "an empty file"
-        raise DatasetError(f"{location}: expected a PNG or JPEG image, got {got}")
+        raise DatasetError(f"{location}: expected a PNG or JPEG image, got {other}")
     size_px = image_size(data)
     if size_px is not None:
         require_pixel_count(location, *size_px)
@@ -240,7 +239,7 @@ def read_text(path: Path) -> str:
     try:
         data = path.read_bytes()
         foreign = foreign_format(data[:FOREIGN_BYTES])
-        if foreign and not data.lstrip().startswith(b"{"):
+        if foreign and data.lstrip()[:1] not in (b"", b"{"):
             raise DatasetError(f"{path}: expected a text file, got {foreign}")
         if data.startswith(_UTF_16):
             return data.decode("utf-16")

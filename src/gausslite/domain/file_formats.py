@@ -34,7 +34,8 @@ def foreign_format(start: bytes) -> str:
     trimmed = start.lstrip().lower()
     if start[257:262] == b"ustar":
         return "a tar archive; unpack it first"
-    return next((name for magic, name in _FOREIGN_FORMATS if start.startswith(magic) or trimmed.startswith(magic)), "")
+    named = (name for magic, name in _FOREIGN_FORMATS if start.startswith(magic) or trimmed.startswith(magic))
+    return next(named, "" if start else "an empty file")
 
 
 def foreign_file(path: Path) -> str:

@@ -171,7 +171,8 @@ def test_damage_is_named(
     ("make", "message"),
     [
         (lambda path: None, "got nothing there"),
-        (lambda path: path.write_text(""), "got a file"),
+        (lambda path: path.write_text("x"), "got a file"),
+        (lambda path: path.write_text(""), "got an empty file"),
         (lambda path: path.mkdir(), "got an empty folder"),
         (lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
     ],

@@ -30,6 +30,7 @@ def tar() -> bytes:
         (gzip.compress(b"x", mtime=0), "a gzip archive; unpack it first"),
         (tar(), "a tar archive; unpack it first"),
         (b"\x89PNG\r\n\x1a\n", "a PNG image"),
+        (b"", "an empty file"),
     ],
 )
 def test_a_foreign_file_is_named(tmp_path: Path, name: str, content: bytes, found: str) -> None:

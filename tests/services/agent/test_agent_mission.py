@@ -282,13 +282,22 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
         end(process)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=hangup)])
-def test_received_frames_give_a_map_and_a_report_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (signal.SIGTERM,),
+        pytest.param((signal.SIGHUP,), marks=hangup),
+        pytest.param((signal.SIGINT, signal.SIGINT, signal.SIGTERM), id="a launcher"),
+    ],
+)
+def test_received_frames_give_a_map_and_a_report_on_signals(tmp_path: Path, numbers: tuple[signal.Signals]) -> None:
     out, options = tmp_path / "out", cup_options(tmp_path)
     with agent_process(tmp_path, *options, "--out", str(out), "--task", "Pick up the cup") as (process, client):
         client.assign_task("Pick up the cup")
         outcomes = list(client.ingest([frame(i, CAMERA) for i in range(2)]))
-        log = end(process, number=number)
+        for number in numbers[:-1]:
+            process.send_signal(number)
+        log = end(process, number=numbers[-1])
     report = json.loads((out / "report.json").read_text())
     assert [outcome.outcome for outcome in outcomes] == [FRAME_OUTCOME_MAPPED] * 2
     assert report["frames"] == 2
