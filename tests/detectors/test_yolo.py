@@ -175,7 +175,13 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     assert strict.notes == ("what looks like 'laptop' is rather 'tv': not activated; --accept-similar accepts it",)
     (report,) = strict.nouns
     assert (report.rival, report.objects, report.best_score) == ("tv", 0, pytest.approx(0.4))
-    assert report.describe().endswith("best score 0.40, 0 confirmed")
+    assert report.describe().endswith("best score 0.40, none confirmed, rather 'tv'")
+    once = TaskRelevanceEstimator(
+        task, detector_from(write_tiny_yolo(tmp_path / "once.onnx", ("tv", "laptop"), [laptop]))
+    )
+    once.estimate(frames[0])
+    assert once.objects == ()
+    assert once.nouns[0].describe().endswith("none confirmed, which takes two moments or places")
     restored = TaskRelevanceEstimator(task, detector)
     restored.restore(strict.state())
     assert restored.nouns == strict.nouns

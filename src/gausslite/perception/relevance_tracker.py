@@ -103,7 +103,8 @@ class RelevanceTracker:
         landmarks = self._object_map.with_phrase(match.noun)
         detections, best_score, best_frame = self._seen.get(match.noun, (0, 0.0, None))
         rival = next(filter(None, map(self._evidence.rival, landmarks)), None)
-        return NounReport(match, detections, best_score, len(self._evidence.confirmed(landmarks)), rival, best_frame)
+        reported = list(filter(self._evidence.is_witnessed, self._evidence.confirmed(landmarks)))
+        return NounReport(match, detections, best_score, len(reported), rival, best_frame)
 
     def state(self) -> State:
         """Return the landmarks and the keyframe's pose as named arrays."""
@@ -200,15 +201,12 @@ class RelevanceTracker:
     def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
         """Return an earlier frame's relevance with the targets that became known since, where it does not show them."""
         new = self._known_targets[relevance.known_objects :]
-        masks = [
-            (name, surface_mask(landmark.votes, frame))
-            for landmark, name in self._targets.select(self._viewpoint(frame))
-            if landmark.number in new
-        ]
         missed = [
             (name, mask)
-            for name, mask in masks
-            if np.count_nonzero(mask & relevance.roi) < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
+            for landmark, name in self._targets.select(self._viewpoint(frame))
+            if landmark.number in new
+            and np.count_nonzero((mask := surface_mask(landmark.votes, frame)) & relevance.roi)
+            < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
         ]
         added = merge_masks(missed, self._graph.targets, frame)
         is_new = added.roi & ~relevance.roi
