@@ -241,6 +241,7 @@ def test_an_object_with_a_far_lower_score_than_another_is_left_out(tmp_path, sco
     assert all(lenient_roi[:, half].any() for half in (left, right))
     left_out = ("'bottle': 1 scored far below the best, so not activated; --accept-similar accepts all",)
     assert strict.notes == (left_out if False in marked else ())
+    assert (len(strict.objects), len(lenient.objects)) == (1 if False in marked else 2, 2)
 
 
 @pytest.mark.parametrize(

@@ -92,19 +92,19 @@ class RelevanceTracker:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
-        """The confirmed objects of the task by their roles, the most confident first."""
-        confirmed = self._evidence.confirmed(self.landmarks)
-        witnessed = filter(self._evidence.is_witnessed, confirmed)
-        kept = (found for found in witnessed if not self._targets.is_excluded(found))
-        return describe_landmarks([(found, self._targets.role(found)) for found in kept])
+        """The confirmed objects of the task by their roles, without far lower scores, the most confident first."""
+        confirmed = filter(self._evidence.is_witnessed, self._evidence.confirmed(self.landmarks))
+        kept = [found for found in confirmed if not self._targets.is_excluded(found)]
+        sure = self._evidence.without_low_scores(kept)
+        return describe_landmarks([(found, self._targets.role(found)) for found in sure])
 
     def report(self, match: NounMatch) -> NounReport:
         """Return what has been detected of a noun so far."""
         landmarks = self._object_map.with_phrase(match.noun)
         detections, best_score, best_frame = self._seen.get(match.noun, (0, 0.0, None))
         rival = next(filter(None, map(self._evidence.rival, landmarks)), None)
-        reported = list(filter(self._evidence.is_witnessed, self._evidence.confirmed(landmarks)))
-        return NounReport(match, detections, best_score, len(reported), rival, best_frame)
+        count = sum(found.noun == match.noun for found in self.objects)
+        return NounReport(match, detections, best_score, count, rival, best_frame)
 
     def state(self) -> State:
         """Return the landmarks and the keyframe's pose as named arrays."""
