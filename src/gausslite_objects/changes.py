@@ -16,23 +16,24 @@ from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.mapping.free_space import view_counts
 from gausslite_objects.life import Life, LifeState, life_of
-from gausslite_objects.visit import GRID, Visit, cell_neighbours, is_empty, near_boxes, near_cells
+from gausslite_objects.visit import GRID, STAYS_M, Visit, cell_neighbours, is_empty, near_boxes
 
 _SAME_PLACE_M = 0.15
 """An object is where it was if its centre moved less than this, or less than half of its longest side."""
 _MAX_RATIO = 2.5
 """Of the longest sides of one object in two runs."""
 _EXPLAINED_M = 0.1
-_CORE_CELLS, _MIN_CORE = 1, 3
-"""Cells without a neighbour that stays, which a change has: errors of poses and depth are slivers along what stays."""
+_CORE_M, _MIN_CORE = 0.07, 4
+"""A change has so many cells this far from what stays: errors of poses and depth are slivers along it."""
 _MIN_SIDE_M = 0.08
 _GROWTH = 0.25
 """A thing reaches beyond what is seen to have changed by this share of that part's longest side, where nothing is
 decided."""
-_SIZE_RATIO, _COLOUR_DISTANCE = 3.0, 0.2
-"""A surface that is gone and a new one are one thing if size and mean colour differ by less."""
+_SIZE_RATIO, _HUE_DISTANCE, _GAIN_DISTANCE = 1.6, 0.3, 0.5
+"""A surface that is gone and a new one are one thing if they differ by less: in size, and in the logarithm of colours,
+between the channels and in their mean, which the camera's gain changes."""
+_MIN_COLOUR = 0.04
 
 Point = tuple[float, float, float]
 
@@ -162,7 +163,7 @@ def _object_changes(before: Visit, after: Visit) -> tuple[list[Change], list[Cha
 
 
 def _life(landmark: ObjectLandmark, own: Visit, other: Visit) -> Life:
-    return life_of(own.points_of(landmark), other.views, other.times_ns)
+    return life_of(own.points_of(landmark), other)
 
 
 def _joined(objects: Iterable[ObjectLandmark]) -> list[ObjectLandmark]:
@@ -217,7 +218,8 @@ class _Surface:
         size = float(np.abs(np.log(sizes[0] / sizes[1])).max() / np.log(_SIZE_RATIO))
         if self.rgb is None or other.rgb is None:
             return size
-        return max(size, float(np.abs(self.rgb - other.rgb).max()) / _COLOUR_DISTANCE)
+        ratios = np.log(np.maximum(self.rgb, _MIN_COLOUR) / np.maximum(other.rgb, _MIN_COLOUR))
+        return max(size, float(np.ptp(ratios)) / _HUE_DISTANCE, abs(float(ratios.mean())) / _GAIN_DISTANCE)
 
 
 def _point(values: Float32[ndarray, "3"]) -> Point:
@@ -228,14 +230,15 @@ def _point(values: Float32[ndarray, "3"]) -> Point:
 def _surfaces(visit: Visit, other: Visit, explained: Sequence[ObjectLandmark]) -> Iterator[_Surface]:
     """Yield the things without a name of a visit whose places the other visit's views saw empty."""
     points_m = visit.surface_m
-    through, shown = view_counts(points_m, other.views)
-    empty = is_empty(through, shown)
-    open_m = points_m[~empty & (shown == 0)]
-    stays_m = points_m[~empty & (shown > 0)]
-    is_named = near_boxes(explained, _EXPLAINED_M, points_m)
-    is_gone = empty & ~is_named
+    through, shown = (np.zeros(len(points_m), np.int64) for _ in range(2))
+    for through_here, shown_here, _ in other.verdicts(points_m):
+        through += through_here
+        shown += shown_here
+    distances_m = other.distance_m(points_m)
+    is_gone = is_empty(through, shown) & (distances_m > STAYS_M) & ~near_boxes(explained, _EXPLAINED_M, points_m)
+    open_m = points_m[(through == 0) & (distances_m > STAYS_M)]
     gone_m = points_m[is_gone]
-    is_core = ~near_cells(gone_m, stays_m, _CORE_CELLS) & visit.is_repeated[is_gone]
+    is_core = visit.is_repeated[is_gone] & (distances_m[is_gone] > _CORE_M)
     for rows in _connected(gone_m):
         thing_m = gone_m[rows]
         if np.count_nonzero(is_core[rows]) < _MIN_CORE:

@@ -6,7 +6,6 @@ is occluded or out of view: nothing is said about it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -14,8 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.mapping.free_space import DepthView
-from gausslite_objects.visit import MIN_POINTS, is_empty
+from gausslite_objects.visit import MIN_POINTS, Visit, is_empty
 
 _MIN_KNOWN, _MIN_EMPTY = 0.3, 0.5
 """Shares: of a thing's points that views decide; of these, that are empty where it is absent."""
@@ -56,17 +54,16 @@ class Life:
         return {"state": str(self.state), "last_shown_ns": self.shown_ns, "last_absent_ns": self.absent_ns}
 
 
-def life_of(points_m: Float32[ndarray, "n 3"], views: Sequence[DepthView], times_ns: Sequence[int]) -> Life:
-    """Return what views say about a thing with these surface points; times_ns: of the views, oldest first."""
+def life_of(points_m: Float32[ndarray, "n 3"], visit: Visit) -> Life:
+    """Return what the views of a visit, oldest first, say about a thing with these surface points."""
     through, shown, hidden = (np.zeros(len(points_m), np.int64) for _ in range(3))
     shown_ns: int | None = None
     absent_ns: int | None = None
-    for view, time_ns in zip(views, times_ns, strict=True):
-        through_here, shown_here = view.classify(points_m)
+    needed = max(MIN_POINTS, _MIN_KNOWN * len(points_m))
+    for (through_here, shown_here, hidden_here), time_ns in zip(visit.verdicts(points_m), visit.times_ns, strict=True):
         through += through_here
         shown += shown_here
-        hidden += view.occludes(points_m)
-        needed = max(MIN_POINTS, _MIN_KNOWN * len(points_m))
+        hidden += hidden_here
         if np.count_nonzero(shown_here) >= needed:
             shown_ns = time_ns
         elif np.count_nonzero(through_here) >= needed:

@@ -116,6 +116,5 @@ def _lives(folder: Path, objects: Sequence[ObjectLandmark]) -> dict[str, Life]:
     depths_m = read_depths(folder, keyframes)
     if not depths_m or not (folder / MAP).is_file():
         return {}
-    views, times_ns = depth_views(keyframes, depths_m)
-    visit = Visit(read_ply(folder / MAP), objects, views, times_ns)
-    return {found.object_id: life_of(visit.points_of(found), views, times_ns) for found in objects}
+    visit = Visit(read_ply(folder / MAP), objects, *depth_views(keyframes, depths_m))
+    return {found.object_id: life_of(visit.points_of(found), visit) for found in objects}

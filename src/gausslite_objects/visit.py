@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+import small_gicp
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
-from gausslite.domain.camera import back_project
+from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import without_depth_edges
 from gausslite.domain.gaussians import Gaussians
@@ -27,6 +29,12 @@ _MAX_DEPTH_M = 5.0
 _DEPTH_EDGE_PX = 1
 _MIN_PIXELS = 2
 _MIN_OPACITY = 0.5
+_MEASURED_GRID = VoxelGrid(0.025)
+STAYS_M = 0.04
+"""Distance to what a visit has measured within which a point is on that surface: errors of poses and depth."""
+_BEHIND_M, _BEHIND_SHARE = 0.02, 0.01
+"""A point farther from it is seen through if the depth behind it is farther by this."""
+_NEIGHBOURS = np.ones((5, 5), np.uint8)
 MIN_POINTS = 8
 """Points of an object below which nothing is said about it."""
 
@@ -55,12 +63,37 @@ class Visit:
         points = list(map(_points, self.views))
         view_of = np.repeat(np.arange(len(points)), [len(own) for own in points])
         points_m = np.concatenate([np.zeros((0, 3), np.float32), *points])
-        _, cell, count = np.unique(GRID.keys(points_m), return_inverse=True, return_counts=True)
-        means_m = np.stack([np.bincount(cell, weights=axis) for axis in points_m.T], axis=1) / count[:, None]
+        means_m, cell, count = _cell_means(points_m, GRID)
         measured = np.bincount(np.unique(cell * len(points) + view_of) // max(len(points), 1), minlength=len(count))
         through, _ = view_counts(means_m.astype(np.float32), self.views)
         is_sure = (count >= _MIN_PIXELS) & ~is_empty(through, measured)
         return means_m[is_sure].astype(np.float32), measured[is_sure] > 1
+
+    @cached_property
+    def _measured(self) -> small_gicp.KdTree | None:
+        """All that the views measured, in cells of 2.5 cm; None for nothing."""
+        cells_m = [_cell_means(_points(view, edge_px=0), _MEASURED_GRID)[0] for view in self.views]
+        cells_m = [np.zeros((0, 3)), *cells_m]
+        points_m = _cell_means(np.concatenate(cells_m).astype(np.float32), _MEASURED_GRID)[0]
+        return small_gicp.KdTree(points_m, num_threads=1) if len(points_m) else None
+
+    def distance_m(self, points_m: Float32[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
+        """Return how far each point is from what the views measured; infinite if they measured nothing."""
+        if self._measured is None or len(points_m) == 0:
+            return np.full(len(points_m), np.inf)
+        _, squares = self._measured.batch_nearest_neighbor_search(points_m.astype(np.float64), num_threads=1)
+        distances_m: Float64[ndarray, " n"] = np.sqrt(np.asarray(squares, np.float64))
+        return distances_m
+
+    def verdicts(
+        self, points_m: Float32[ndarray, "n 3"]
+    ) -> Iterator[tuple[Bool[ndarray, " n"], Bool[ndarray, " n"], Bool[ndarray, " n"]]]:
+        """Yield which points each view sees through, at which it shows a surface, and which it does not see."""
+        is_far = self.distance_m(points_m) > STAYS_M
+        for view in self.views:
+            through, shown = view.classify(points_m)
+            through |= is_far & view.sees_through(points_m, _BEHIND_M, _BEHIND_SHARE)
+            yield through, shown & ~is_far, view.occludes(points_m)
 
     @cached_property
     def opaque(self) -> Gaussians:
@@ -107,9 +140,19 @@ def depth_views(
     """Return the views of the keyframes with a depth image, and their capture times."""
     seen = [view for view in keyframes if view.index in depths_m]
     views = [
-        DepthView.of(depths_m[view.index], view.camera.narrower(REDUCED_WIDTH_PX), view.T_world_camera) for view in seen
+        depth_view(depths_m[view.index], view.camera.narrower(REDUCED_WIDTH_PX), view.T_world_camera) for view in seen
     ]
     return views, [view.capture_time_ns for view in seen]
+
+
+def depth_view(depth_m: Float32[ndarray, "h w"], camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> DepthView:
+    """Return the view of a reduced depth image, with the nearest depth measured around each pixel that has one.
+
+    Sensors miss single pixels of dark and glossy surfaces; beside each, nothing would be decided.
+    """
+    nearest_m = cv2.erode(np.where(depth_m > 0, depth_m, np.float32(np.inf)), _NEIGHBOURS)
+    view = DepthView.of(depth_m, camera, T_world_camera)
+    return replace(view, nearest_m=np.where(depth_m > 0, nearest_m, np.float32(0.0)))
 
 
 def is_empty(through: Int64[ndarray, " n"], shown: Int64[ndarray, " n"]) -> Bool[ndarray, " n"]:
@@ -122,11 +165,20 @@ def is_empty(through: Int64[ndarray, " n"], shown: Int64[ndarray, " n"]) -> Bool
     return empty
 
 
-def _points(view: DepthView) -> Float32[ndarray, "n 3"]:
-    depth_m = without_depth_edges(view.depth_m, _DEPTH_EDGE_PX)
+def _points(view: DepthView, edge_px: int = _DEPTH_EDGE_PX) -> Float32[ndarray, "n 3"]:
+    depth_m = without_depth_edges(view.depth_m, edge_px)
     points = back_project(depth_m, view.camera)[(depth_m > 0) & (depth_m <= _MAX_DEPTH_M)]
     points_m: Float32[ndarray, "n 3"] = transform_points(inverse(view.T_camera_world), points).astype(np.float32)
     return points_m
+
+
+def _cell_means(
+    points_m: Float32[ndarray, "n 3"], grid: VoxelGrid
+) -> tuple[Float64[ndarray, "m 3"], Int64[ndarray, " n"], Int64[ndarray, " m"]]:
+    """Return the mean of the points in each cell, the cell of each point, and the number of points in each."""
+    _, cell, count = np.unique(grid.keys(points_m), return_inverse=True, return_counts=True)
+    means_m = np.stack([np.bincount(cell, weights=axis) for axis in points_m.T], axis=1) / count[:, None]
+    return means_m, cell, count
 
 
 def cell_neighbours(radius: int) -> Int64[ndarray, " k"]:

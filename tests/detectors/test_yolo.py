@@ -175,7 +175,13 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     assert strict.notes == ("what looks like 'laptop' is rather 'tv': not activated; --accept-similar accepts it",)
     (report,) = strict.nouns
     assert (report.rival, report.objects, report.best_score) == ("tv", 0, pytest.approx(0.4))
-    assert report.describe().endswith("best score 0.40, 0 confirmed")
+    assert report.describe().endswith("best score 0.40, none confirmed, rather 'tv'")
+    once = TaskRelevanceEstimator(
+        task, detector_from(write_tiny_yolo(tmp_path / "once.onnx", ("tv", "laptop"), [laptop]))
+    )
+    once.estimate(frames[0])
+    assert once.objects == ()
+    assert once.nouns[0].describe().endswith("none confirmed, which takes two moments or places")
     restored = TaskRelevanceEstimator(task, detector)
     restored.restore(strict.state())
     assert restored.nouns == strict.nouns
@@ -235,6 +241,7 @@ def test_an_object_with_a_far_lower_score_than_another_is_left_out(tmp_path, sco
     assert all(lenient_roi[:, half].any() for half in (left, right))
     left_out = ("'bottle': 1 scored far below the best, so not activated; --accept-similar accepts all",)
     assert strict.notes == (left_out if False in marked else ())
+    assert (len(strict.objects), len(lenient.objects)) == (1 if False in marked else 2, 2)
 
 
 @pytest.mark.parametrize(

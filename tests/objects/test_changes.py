@@ -10,10 +10,9 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.mapping.free_space import DepthView
 from gausslite_objects.changes import Change, ChangeKind, compare_visits, with_earlier_objects
 from gausslite_objects.life import LifeState, life_of
-from gausslite_objects.visit import Visit
+from gausslite_objects.visit import Visit, depth_view
 
 WALL_M, BOX_M = 3.0, 0.4
 HERE, THERE, OUTSIDE = (-0.5, 0.0, 2.0), (0.5, 0.1, 2.0), (6.0, 0.0, 2.0)
@@ -47,7 +46,7 @@ def _visit(boxes_m: list[tuple[float, float, float]], objects: list[ObjectLandma
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = 0.1 * index
         rendering = camera.render(CAMERA, T_world_camera)
-        seen.append(DepthView.of(rendering.expected_depth_m(0.8), CAMERA, T_world_camera))
+        seen.append(depth_view(rendering.expected_depth_m(0.8), CAMERA, T_world_camera))
     return Visit(gaussians, objects, seen, range(views))
 
 
@@ -91,12 +90,11 @@ def test_what_one_run_does_not_see_is_unknown() -> None:
 def test_a_thing_is_present_absent_occluded_or_out_of_view(
     boxes_m: list[tuple[float, float, float]], place_m: tuple[float, float, float], state: LifeState
 ) -> None:
-    views = _visit(boxes_m, []).views
-    life = life_of(_grid(place_m, 0.3).astype(np.float32), views, [10, 20, 30, 40])
+    life = life_of(_grid(place_m, 0.3).astype(np.float32), _visit(boxes_m, []))
     assert life.state is state
     assert life.confidence(0.8) == (0.0 if state is LifeState.ABSENT else 0.8)
-    assert life.shown_ns == (40 if state is LifeState.PRESENT else None)
-    assert life.absent_ns == (40 if state is LifeState.ABSENT else None)
+    assert life.shown_ns == (3 if state is LifeState.PRESENT else None)
+    assert life.absent_ns == (3 if state is LifeState.ABSENT else None)
 
 
 def test_what_a_single_view_measures_is_no_thing() -> None:

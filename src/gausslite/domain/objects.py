@@ -94,7 +94,7 @@ class NounReport:
     match: NounMatch
     detections: int = 0  # their number in all frames
     best_score: float = 0.0  # the highest, in best_frame, below thresholds too; 0 and None without any
-    objects: int = 0  # the number of confirmed ones
+    objects: int = 0  # the number of reported ones
     rival: str | None = None  # the class that the detections rather show, or None
     best_frame: int | None = None  # number of the frame with the best score
 
@@ -102,7 +102,9 @@ class NounReport:
         """Return one line for the operator: what was found, or why nothing was."""
         if not self.match.is_searched:
             return self.match.describe()
-        found = f"{self.detections} detections, best score {self.best_score:.2f}, {self.objects} confirmed"
+        why = f"rather {self.rival!r}" if self.rival else "which takes two moments or places"
+        confirmed = f"{self.objects} confirmed" if self.objects else f"none confirmed, {why}"
+        found = f"{self.detections} detections, best score {self.best_score:.2f}, {confirmed}"
         return f"{self.match.describe()}: {found if self.detections or self.objects else self._unseen()}"
 
     def _unseen(self) -> str:

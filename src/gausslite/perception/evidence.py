@@ -87,10 +87,10 @@ class Evidence:
         return is_certain or landmark.view_count >= self.settings.min_seen
 
     def without_low_scores(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
-        """Return those of one target's landmarks whose confidence is not far below the best of all."""
-        found = (landmark.confidence for landmark in landmarks if not landmark.is_given)
-        limit = self.settings.min_score_share * max(found, default=0.0)
-        return [landmark for landmark in landmarks if landmark.confidence >= limit]
+        """Return the landmarks whose confidence is not far below the best of their noun."""
+        best = dict(sorted((found.phrase, found.confidence) for found in landmarks if not found.is_given))
+        least = self.settings.min_score_share
+        return [found for found in landmarks if found.confidence >= least * best.get(found.phrase, 0.0)]
 
     def is_present(self, landmark: Landmark) -> bool:
         """Return True if the latest frame with detections found the landmark, or few of its frames missed it."""

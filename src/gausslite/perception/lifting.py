@@ -16,7 +16,7 @@ from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Detection
 from gausslite.nouns import is_convex
 from gausslite.perception.object_map import Observation
-from gausslite.perception.surface import mask_votes
+from gausslite.perception.surface import is_off_planes, mask_votes, window_around
 
 _MIN_PIXELS = 8
 """Pixels with depth that an observation needs."""
@@ -45,17 +45,9 @@ _RING_INNER_PX = 2
 """Pixels next to the outline that show no plane: their depth is often between two surfaces."""
 _RING_OUTER_PX = 9
 """Width of the ring around a mask in which planes are searched."""
-_MAX_PLANES = 3
-_PLANE_SAMPLES = 64
-_MAX_RING_POINTS = 600
-_MIN_RING_POINTS = 30
-_MIN_PLANE_SHARE = 0.2
-"""Share of the ring's points that a plane has."""
 _PLANE_DISTANCE_M = 0.015
 _PLANE_DISTANCE_SHARE = 0.01
 """Distance within which points are on a plane, in metres and as a share of depth; the larger one counts."""
-_MIN_LEFT_SHARE = 0.2
-"""Share of a mask that planes leave, from which they are its background; below, the object is flat itself."""
 _MIN_PLANE_EXTENT_M = 0.25
 """Extent from which a plane can be seen to be one."""
 _MAX_PLANE_THICKNESS_SHARE = 0.06
@@ -134,16 +126,11 @@ def _lift(
         points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
     points_m = transform_points(frame.T_world_camera, points)
     observation = Observation.from_points(
-        detection.phrase,
-        points_m,
-        frame.T_world_camera[:3, 3],
-        detection.score,
-        frame.capture_time_ns,
+        detection.phrase, points_m, frame.T_world_camera[:3, 3], detection.score, frame.capture_time_ns
     )
-    if not is_convex(detection.phrase):
-        plane = FittedPlane.of(observation.without_outliers(points_m))
-        if plane.is_level_or_upright(up):
-            return None
+    own_m = observation.without_outliers(points_m)
+    if not is_convex(detection.phrase) and FittedPlane.of(own_m).is_level_or_upright(up):
+        return None
     if detection.is_weak:
         return replace(observation, rival=detection.rival, is_weak=True)
     return replace(observation, rival=detection.rival, votes=mask_votes(detection.mask, frame, siblings))
@@ -158,8 +145,7 @@ def _own_pixels(detection: Detection, of_noun: Mapping[str, Bool[ndarray, "h w"]
     for noun, claimed in of_noun.items():
         if noun != detection.phrase:
             own &= ~claimed
-    has_enough = np.count_nonzero(own) >= _MIN_OWN_SHARE * np.count_nonzero(detection.mask)
-    return own if has_enough else detection.mask
+    return own if np.count_nonzero(own) >= _MIN_OWN_SHARE * np.count_nonzero(detection.mask) else detection.mask
 
 
 def foreground_mask(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
@@ -189,9 +175,8 @@ def filled_outline(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"])
     outline = cv2.convexHull(np.stack([columns, rows], axis=1).astype(np.int32))
     hull = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
     nearest_m, farthest_m = np.percentile(known, (_OUTER_PERCENT, 100.0 - _OUTER_PERCENT))
-    slack_m = _DEPTH_SLACK_M
     # in the outline, at the depth of the object
-    added = hull & ~mask & (depth_m >= nearest_m - slack_m) & (depth_m <= farthest_m + slack_m)
+    added = hull & ~mask & (depth_m >= nearest_m - _DEPTH_SLACK_M) & (depth_m <= farthest_m + _DEPTH_SLACK_M)
     wide = np.ones((_MIN_ADDED_PX, _MIN_ADDED_PX), np.uint8)
     filled: Bool[ndarray, "h w"] = mask | (cv2.morphologyEx(added.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0)
     return filled
@@ -202,27 +187,17 @@ def without_background_planes(
 ) -> Bool[ndarray, "h w"]:
     """Return the mask without pixels on planes that also surround it, such as the wall behind or the floor below it.
 
-    Depth has no clear gap there. A plane has a fifth of the points in a ring around the mask. If planes have more than
-    four fifths of the mask, the mask is unchanged: then the object is flat itself.
+    Depth has no clear gap there. If planes have four fifths of the mask, it is unchanged: the object is flat itself.
     """
-    if not mask.any():
+    window = window_around(mask, _RING_OUTER_PX)
+    if window is None:
         return mask
-    rows, columns = np.nonzero(mask)
-    margin_px = _RING_OUTER_PX
-    window = (
-        slice(max(0, int(rows.min()) - margin_px), int(rows.max()) + 1 + margin_px),
-        slice(max(0, int(columns.min()) - margin_px), int(columns.max()) + 1 + margin_px),
-    )
     inside, depths_m = mask[window], depth_m[window]
     points_m = back_project(depths_m, camera, window[1].start, window[0].start).astype(np.float64)
-    limits_m = np.maximum(_PLANE_DISTANCE_M, _PLANE_DISTANCE_SHARE * depths_m)
-    left = inside.copy()
-    for plane in _planes(points_m[_ring(inside) & (depths_m > 0)]):  # what goes on beside the mask is not the object
-        left &= (depths_m == 0) | (np.abs(points_m @ plane[:3] - plane[3]) > limits_m)
-    if np.count_nonzero(left) < _MIN_LEFT_SHARE * np.count_nonzero(inside):  # flat itself, such as a rug on the floor
-        return mask
+    limits_m = np.where(depths_m > 0, np.maximum(_PLANE_DISTANCE_M, _PLANE_DISTANCE_SHARE * depths_m), -1.0)
+    ring = _ring(inside) & (depths_m > 0)
     out = mask.copy()
-    out[window] = left
+    out[window][inside] = is_off_planes(points_m[inside], limits_m[inside], points_m[ring], limits_m[ring])
     return out
 
 
@@ -234,28 +209,6 @@ def _ring(inside: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     )
     ring: Bool[ndarray, "h w"] = near & ~outline
     return ring
-
-
-def _planes(points_m: Float64[ndarray, "n 3"]) -> list[Float64[ndarray, "4"]]:
-    """Return unit normals and offsets of some planes, the largest first; each from random triples of points."""
-    points_m = points_m[:: max(1, len(points_m) // _MAX_RING_POINTS)]
-    min_points = max(_MIN_RING_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
-    rng = np.random.default_rng(0)  # the same planes in each run
-    planes: list[Float64[ndarray, "4"]] = []
-    while len(planes) < _MAX_PLANES and len(points_m) >= min_points:
-        corners = points_m[rng.integers(len(points_m), size=(_PLANE_SAMPLES, 3))]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
-        offsets_m = np.einsum("ij,ij->i", normals, corners[:, 0])
-        limits_m = np.maximum(_PLANE_DISTANCE_M, _PLANE_DISTANCE_SHARE * points_m[:, 2])
-        is_near = (np.abs(points_m @ normals.T - offsets_m) < limits_m[:, None]) & (lengths[:, 0] > 0)
-        best = int(is_near.sum(axis=0).argmax())
-        if np.count_nonzero(is_near[:, best]) < min_points:
-            break
-        planes.append(np.append(normals[best], offsets_m[best]))
-        points_m = points_m[~is_near[:, best]]
-    return planes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

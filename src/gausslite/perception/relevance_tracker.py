@@ -92,18 +92,19 @@ class RelevanceTracker:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
-        """The confirmed objects of the task by their roles, the most confident first."""
-        confirmed = self._evidence.confirmed(self.landmarks)
-        witnessed = filter(self._evidence.is_witnessed, confirmed)
-        kept = (found for found in witnessed if not self._targets.is_excluded(found))
-        return describe_landmarks([(found, self._targets.role(found)) for found in kept])
+        """The confirmed objects of the task by their roles, without far lower scores, the most confident first."""
+        confirmed = filter(self._evidence.is_witnessed, self._evidence.confirmed(self.landmarks))
+        kept = [found for found in confirmed if not self._targets.is_excluded(found)]
+        sure = self._evidence.without_low_scores(kept)
+        return describe_landmarks([(found, self._targets.role(found)) for found in sure])
 
     def report(self, match: NounMatch) -> NounReport:
         """Return what has been detected of a noun so far."""
         landmarks = self._object_map.with_phrase(match.noun)
         detections, best_score, best_frame = self._seen.get(match.noun, (0, 0.0, None))
         rival = next(filter(None, map(self._evidence.rival, landmarks)), None)
-        return NounReport(match, detections, best_score, len(self._evidence.confirmed(landmarks)), rival, best_frame)
+        count = sum(found.noun == match.noun for found in self.objects)
+        return NounReport(match, detections, best_score, count, rival, best_frame)
 
     def state(self) -> State:
         """Return the landmarks and the keyframe's pose as named arrays."""
@@ -200,15 +201,12 @@ class RelevanceTracker:
     def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
         """Return an earlier frame's relevance with the targets that became known since, where it does not show them."""
         new = self._known_targets[relevance.known_objects :]
-        masks = [
-            (name, surface_mask(landmark.votes, frame))
-            for landmark, name in self._targets.select(self._viewpoint(frame))
-            if landmark.number in new
-        ]
         missed = [
             (name, mask)
-            for name, mask in masks
-            if np.count_nonzero(mask & relevance.roi) < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
+            for landmark, name in self._targets.select(self._viewpoint(frame))
+            if landmark.number in new
+            and np.count_nonzero((mask := surface_mask(landmark.votes, frame)) & relevance.roi)
+            < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
         ]
         added = merge_masks(missed, self._graph.targets, frame)
         is_new = added.roi & ~relevance.roi

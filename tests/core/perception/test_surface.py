@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -190,3 +191,13 @@ def test_masks_at_the_border_and_empty_masks():
     rgb, square = red_square()
     assert not snapped_to_edges(np.zeros_like(square), rgb).any()
     assert snapped_to_edges(np.ones_like(square), rgb).all()
+
+
+def test_a_plane_around_the_masks_adds_nothing_to_the_extent():
+    votes = SurfaceVotes.empty()
+    for frame in (frame_at(x_m) for x_m in (0.0, 0.1, -0.1)):
+        spilled = cv2.dilate(box_mask(frame).astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+        votes = votes.add(mask_votes(spilled, frame))
+    assert np.count_nonzero(votes.surface_m[:, 2] > 1.9) > 0.2 * len(votes.surface_m)
+    assert votes.box is not None
+    assert np.subtract(votes.box.max_m, votes.box.min_m) == pytest.approx((0.4, 0.4, 0.0), abs=0.06)
