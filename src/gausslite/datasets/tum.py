@@ -31,12 +31,7 @@ from gausslite.datasets.folder import (
     is_lost,
     pose_from_quaternion,
 )
-from gausslite.datasets.source import (
-    excluded_frames_note,
-    repeated_times_note,
-    require_matches,
-    require_position,
-)
+from gausslite.datasets.source import excluded_frames_note, repeated_times_note, require_matches, require_position
 from gausslite.domain.camera import FileIntrinsics, Lens, LensModel
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame

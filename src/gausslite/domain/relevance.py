@@ -170,6 +170,7 @@ class Rival:
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
     """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class.
+    class_name: of the detector, empty if it has none.
 
     is_weak: the score is below the detector's threshold. It supports an object that other frames found, nothing else.
     is_exact: the mask is ground truth, not a network's.
@@ -182,6 +183,7 @@ class Detection:
     rival: Rival | None = None
     is_weak: bool = False
     is_exact: bool = False
+    class_name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +195,7 @@ class DetectedBox:
     box_px: tuple[float, float, float, float]
     rival: Rival | None = None
     is_weak: bool = False
+    class_name: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -134,11 +134,7 @@ def _lift(
         points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
     points_m = transform_points(frame.T_world_camera, points)
     observation = Observation.from_points(
-        detection.phrase,
-        points_m,
-        frame.T_world_camera[:3, 3],
-        detection.score,
-        frame.capture_time_ns,
+        detection.phrase, points_m, frame.T_world_camera[:3, 3], detection.score, frame.capture_time_ns
     )
     if not is_convex(detection.phrase):
         plane = FittedPlane.of(observation.without_outliers(points_m))

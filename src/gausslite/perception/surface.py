@@ -279,9 +279,7 @@ def _edge_window() -> tuple[int, int]:
 
 
 def _guided_filter(
-    guide: Float32[ndarray, "h w 3"],
-    values: Float32[ndarray, "h w"],
-    wanted: Bool[ndarray, "h w"],
+    guide: Float32[ndarray, "h w 3"], values: Float32[ndarray, "h w"], wanted: Bool[ndarray, "h w"]
 ) -> Float32[ndarray, "h w"]:
     """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels."""
     window = _edge_window()
@@ -306,11 +304,7 @@ def _guided_filter(
 Window = tuple[slice, slice]
 
 
-def mask_votes(
-    mask: Bool[ndarray, "h w"],
-    frame: Frame,
-    siblings: Bool[ndarray, "h w"] | None = None,
-) -> SurfaceVotes:
+def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame, siblings: Bool[ndarray, "h w"] | None = None) -> SurfaceVotes:
     """Return the votes of a detected mask: inside for its pixels, outside for the other pixels around it.
 
     siblings: pixels of the frame's detections of the same noun. They never vote outside: adjacent objects of one noun

@@ -24,6 +24,7 @@ from page_controls import SeenPage, control, images, plot, poll_until, text
 
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import encode_mask, frame_to_message
+from gausslite_objects.memory_client import ServerMemory
 from gausslite_view.decoding import stored_keyframe_from_message
 from gausslite_view.fusion_panel import FusionPanel
 
@@ -44,7 +45,7 @@ def test_the_page_shows_who_won_each_voxel_and_what_it_shows():
         contribute(running, "a", "Pick up the mug", [0.0, 1.0], kappa=5)
         contribute(running, "b", "Find the chair", [1.0, 2.0], kappa=9)
         page, client = SeenPage(), FusionClient(running.client.address)
-        panel = FusionPanel(page, client)
+        panel = FusionPanel(page, client, ServerMemory(client.address))
         try:
             poll_until(panel.poll, lambda: len(page.contents.gaussians) == 3)
             fused = page.contents
@@ -69,7 +70,7 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one():
         assert running.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)]) == 2
         contribute(running, "b", "Find the chair", [1.0], kappa=9)
         page, client = SeenPage(), FusionClient(running.client.address)
-        panel = FusionPanel(page, client)
+        panel = FusionPanel(page, client, ServerMemory(client.address))
         try:
             poll_until(panel.poll, lambda: len(page.contents.gaussians) == 2)
             (shown,) = images(page)
@@ -95,7 +96,7 @@ def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality(mo
         session_b = running.client.join("b", GRID).session_id
         running.client.contribute_keyframes(session_b, [coloured_frame(5, 90)])
         page, client = SeenPage(), FusionClient(running.client.address)
-        panel = FusionPanel(page, client)
+        panel = FusionPanel(page, client, ServerMemory(client.address))
         try:
             poll_until(panel.poll, lambda: len(page.contents.gaussians) == len(wall().gaussians) + 1)
             poll_until(panel.poll, lambda: len(page.contents.paths[0].keyframes) == 20)
@@ -123,7 +124,7 @@ def test_the_time_slider_shows_the_earlier_fused_map_and_keyframe():
         session = running.client.join("a", GRID).session_id
         assert running.client.contribute_keyframes(session, [coloured_frame(3, 40)]) == 1
         page, client = SeenPage(), FusionClient(running.client.address)
-        panel = FusionPanel(page, client)
+        panel = FusionPanel(page, client, ServerMemory(client.address))
         try:
             poll_until(panel.poll, lambda: len(page.contents.gaussians) == 1)
             contribute(running, "b", "Find the chair", [1.0, 2.0], kappa=9)
@@ -235,7 +236,7 @@ def coloured_frame(index: int, grey: int) -> Frame:
 def test_a_refused_refinement_is_reported_on_the_page():
     with fusion_server() as running:
         page = SeenPage()
-        panel = FusionPanel(page, FusionClient(running.client.address))
+        panel = FusionPanel(page, FusionClient(running.client.address), ServerMemory(running.client.address))
         try:
             panel.refine()
             assert "refinement: expected a fused map and keyframes, got 0 Gaussians" in text(page)
