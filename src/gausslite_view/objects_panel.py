@@ -22,7 +22,7 @@ class ObjectsPanel:
     def __init__(self, page: MapPage, memory: ObjectMemory, changed: Callable[[], None]) -> None:
         self._memory, self._changed = memory, changed
         gui = page.server.gui
-        with gui.add_folder("Objects", expand_by_default=False):
+        with gui.add_folder("Edit objects", expand_by_default=False):
             self.chosen: Any = gui.add_dropdown("Object", (_NO_OBJECT,))
             self.kind: Any = gui.add_dropdown("Edit", tuple(map(str, EditKind)))
             self.value: Any = gui.add_text("Value", "", hint=_HINT)

@@ -30,7 +30,7 @@ MUG, VASE = (TaskGraph("id", f"Find the {noun}", (noun,), (), ()) for noun in ("
 def frame(index: int) -> Frame:
     """Return a frame of a bumpy wall 2 m ahead, two seconds after the one before, from a camera that moves sideways."""
     T_world_camera = np.eye(4)
-    T_world_camera[0, 3] = 0.2 * index
+    T_world_camera[0, 3] = 0.1 * index
     x, y = np.meshgrid(np.arange(160), np.arange(120))
     depth_m = (2.0 + 0.05 * np.sin(x / 3.0) * np.cos(y / 3.0)).astype(np.float32)
     rgb = np.full((120, 160, 3), index, np.uint8)
@@ -41,7 +41,7 @@ def factory() -> EstimatorFactory:
     return EstimatorFactory(PerceptionSettings(), lambda: SceneInfo(UP, REGIONS))
 
 
-def estimate(estimator: RelevanceEstimator, indices: Sequence[int] = range(0, 20, 5)) -> list[bytes]:
+def estimate(estimator: RelevanceEstimator, indices: Sequence[int] = range(12)) -> list[bytes]:
     """Return the relevance of frames as bytes."""
     return [estimator.estimate(frame(i)).relevance.pixel_weights.tobytes() for i in indices]
 
