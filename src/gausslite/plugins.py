@@ -32,6 +32,7 @@ class Group(StrEnum):
     POINTING = "gausslite.pointing"  # a `Pointing`: the object at a point, in a box or at a click
     QUESTIONS = "gausslite.questions"  # a function: the objects of a map that a question's task graph means
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
+    OBJECT_MEMORIES = "gausslite.object_memories"  # remembers what a detector sees beside a task's objects
     POLICIES = "gausslite.policies"  # a `MapperSettings` of another system, to compare with; the name is of `--policy`
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
     POSES = "gausslite.poses"  # refines the poses of views, or tracks the camera; the name is a value of `--poses`
@@ -47,6 +48,7 @@ class Group(StrEnum):
     TEAM_MAPS = "gausslite.team_maps"  # inserts what teammates trained into an agent's map
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
+    SERVER_SERVICES = "gausslite.server_services"  # a further service of a fusion server
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server
     RUN_RECORDS = "gausslite.run_records"  # writes a file beside the map of a run
     EVALUATORS = "gausslite.evaluators"  # says how well a finished run fits its images

@@ -70,7 +70,7 @@ class SegmentedDetector:
             for row, mask in zip(rows, segmenter.segment(frame, boxes_px), strict=True):
                 masks[row] = mask
         found = [
-            Detection(box.phrase, box.score, box.box_px, mask, box.rival, box.is_weak)
+            Detection(box.phrase, box.score, box.box_px, mask, box.rival, box.is_weak, class_name=box.class_name)
             for box, mask in zip(boxes, masks, strict=True)
             if mask is not None
         ]

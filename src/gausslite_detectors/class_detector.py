@@ -140,7 +140,7 @@ class ClassDetector:
         candidates = self._distinct(every, query_classes)
         masks, overlaps = output.masks(candidates), self._overlaps(candidates, every)
         found = [
-            Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak)
+            Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak, class_name=box.class_name)
             for row, box in self._boxes(candidates, every, overlaps, query_classes, frame)
             if masks[row].any()
         ]
@@ -199,14 +199,26 @@ class ClassDetector:
                 is_weak = score < self._settings.min_score
                 if is_weak and is_generic(query):
                     continue
-                box = DetectedBox(query, score, (left, top, right, bottom), rival, is_weak)
-                if self._settings.box_limits.accepts(class_nouns(name)[0], box.score, box.box_px, frame):
+                box = DetectedBox(query, score, (left, top, right, bottom), rival, is_weak, class_nouns(name)[0])
+                if self._settings.box_limits.accepts(box.class_name, box.score, box.box_px, frame):
                     yield int(row), box
 
     def _distinct(self, candidates: Candidates, query_classes: Mapping[str, tuple[int, ...]]) -> Candidates:
-        """Return the candidates of the queries' classes after non-maximum suppression."""
-        classes = np.unique([index for indices in query_classes.values() for index in indices]).astype(np.int64)
-        candidates = candidates.take(np.flatnonzero(np.isin(candidates.classes, classes)))
+        """Return the candidates of the queries' classes after non-maximum suppression.
+
+        Those that only a generic query means have a limit of their own: a named thing is found whatever is around it.
+        """
+        named, every = (
+            sorted({index for query, own in query_classes.items() if of_all or not is_generic(query) for index in own})
+            for of_all in (False, True)
+        )
+        is_named = np.isin(candidates.classes, named)
+        is_other = np.isin(candidates.classes, every) & ~is_named & (candidates.scores >= self._settings.min_score)
+        first, second = (self._limited(candidates.take(np.flatnonzero(own))) for own in (is_named, is_other))
+        return first.joined(second)
+
+    def _limited(self, candidates: Candidates) -> Candidates:
+        """Return the best candidates without doubles of one class."""
         if self._network.layout.is_final:
             return candidates.take(np.argsort(-candidates.scores, kind="stable")[: self._settings.max_boxes])
         return suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=False)

@@ -46,6 +46,12 @@ class Candidates:
         """Return the candidates at these places."""
         return Candidates(self.boxes_px[chosen], self.scores[chosen], self.classes[chosen], self.rows[chosen])
 
+    def joined(self, other: Candidates) -> Candidates:
+        """Return these candidates and then the others."""
+        boxes_px, scores = np.concatenate([self.boxes_px, other.boxes_px]), np.concatenate([self.scores, other.scores])
+        classes, rows = np.concatenate([self.classes, other.classes]), np.concatenate([self.rows, other.rows])
+        return Candidates(boxes_px, scores, classes, rows)
+
 
 def letterbox(
     rgb: UInt8[ndarray, "h w 3"], height_px: int, width_px: int, size_px: tuple[int, int] | None = None

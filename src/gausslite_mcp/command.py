@@ -26,7 +26,7 @@ def configure(parser: CommandParser) -> None:
     add("--agent", metavar="HOST:PORT", default="", help="the robot's agent, for assign_task (default: none)")
     http_help = f"serve http://HOST:PORT{_PATH}, not stdin and stdout; beyond this machine it needs --tokens"
     add("--http", metavar="HOST:PORT", help=http_help)
-    tokens_help = "file of lines ROLE TOKEN; viewer reads, operator also assigns tasks (without it, HTTP only reads)"
+    tokens_help = "file of lines ROLE TOKEN; viewer reads, operator also changes things (without it, HTTP only reads)"
     add("--tokens", metavar="FILE", type=Path, help=tokens_help)
     add("--threads", metavar="N", type=bounded(int, 1, 256), help="CPU threads for rendering (default: all cores)")
     add_flags(parser, TlsFiles)

@@ -34,7 +34,10 @@ from gausslite_export.occupancy import (
     planar_grid,
     require_voxels,
 )
-from gausslite_objects.mapped_objects import MappedObjects, query, read_folder
+from gausslite_objects.areas import read_areas
+from gausslite_objects.edits import read_edits
+from gausslite_objects.mapped_objects import MappedObjects, open_memory, query, read_folder
+from gausslite_objects.object_memory import ObjectMemory
 from gausslite_render.splat_map import SplatMap, read_splats
 from gausslite_render.viewer import SplatViewer
 
@@ -121,24 +124,38 @@ class Place(Protocol):
         """Return the map of now. Raises UnavailableError, MapFileError."""
         ...
 
+    def memory(self) -> ObjectMemory:
+        """Return what people say of the place. Raises UnavailableError, MapFileError."""
+        ...
+
 
 class RunPlace:
-    """A run's folder, read once."""
+    """A run's folder. The map is read once, objects again after an edit."""
 
     def __init__(self, folder: Path, threads: int | None = None) -> None:
         """Raises InvalidInputError, MapFileError, CodecError."""
-        self.name = str(folder)
-        self._objects = read_folder(folder)
+        self.name, self._folder = str(folder), folder
+        self._said, self._objects = self._read_said(), read_folder(folder)
         views = evenly(read_keyframe_views(folder), _MAX_VIEWS)
         self._scene = Scene(read_splats(folder), views, self._objects.up_axis, threads)
 
     def objects(self) -> MappedObjects:
-        """Return the objects of report.json."""
+        """Return the objects of report.json after edits."""
+        said = self._read_said()
+        if said != self._said:
+            self._said, self._objects = said, read_folder(self._folder)
         return self._objects
+
+    def _read_said(self) -> tuple[object, ...]:
+        return read_edits(self._folder), read_areas(self._folder)
 
     def scene(self) -> Scene:
         """Return the map of map.ply."""
         return self._scene
+
+    def memory(self) -> ObjectMemory:
+        """Return the edits and areas in the folder."""
+        return open_memory(self.name)
 
 
 class ServerPlace:
@@ -153,6 +170,10 @@ class ServerPlace:
     def objects(self) -> MappedObjects:
         """Return the team's objects. Raises UnavailableError."""
         return query(self.name, self._tls)
+
+    def memory(self) -> ObjectMemory:
+        """Return the edits and areas of the server."""
+        return open_memory(self.name, self._tls)
 
     def scene(self) -> Scene:
         """Return the fused map with the keyframes that the server has. Raises UnavailableError."""

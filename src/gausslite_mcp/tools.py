@@ -22,6 +22,7 @@ from gausslite_mcp.context import relations_of
 from gausslite_mcp.goals import GoalSettings, goal_near
 from gausslite_mcp.object_views import VIEW_CAMERA, best_view, look_at
 from gausslite_mcp.place import Place, Scene, find_object
+from gausslite_objects.edits import EditKind
 from gausslite_objects.mapped_objects import as_json, select
 
 _JPEG_QUALITY = 90
@@ -51,6 +52,30 @@ class PlaceTools:
         others = [other.landmark for other in objects.objects]
         relations = relations_of(found.landmark, others, objects.up_axis)
         return _rounded({"object": as_json(found, objects), **relations})
+
+    def list_areas(self) -> dict[str, Any]:
+        """Return the named areas with the ids of the objects in each."""
+        objects = self.place.objects()
+        areas = [
+            {
+                **area.as_json(),
+                "objects": [
+                    found.landmark.object_id
+                    for found in objects.objects
+                    if area.contains(found.landmark.centroid_m, objects.up_axis)
+                ],
+            }
+            for area in objects.areas
+        ]
+        return _rounded({"areas": areas})
+
+    def edit_object(self, kind: str, name: str, value: str, author: str) -> dict[str, Any]:
+        """Correct an object, or undo the edit of a number. Raises InvalidInputError, NotPermittedError."""
+        if kind not in list(EditKind):
+            raise InvalidInputError(f"kind: expected one of {', '.join(EditKind)}, got {kind[:40]!r}")
+        object_id = name if kind == EditKind.UNDO else find_object(self.place.objects(), name).landmark.object_id
+        entry = self.place.memory().edit(EditKind(kind), object_id, value, author)
+        return {"edit": entry.number, "done": entry.describe()}
 
     def goal_near(
         self, name: str, distance_m: float, radius_m: float, from_m: Sequence[float] | None

@@ -11,6 +11,6 @@ OBJECTS: Final = Command(
     "gausslite_objects.objects_command",
 )
 EDIT: Final = Command(
-    "correct the objects of a run: delete, rename, merge, pin, note, undo",
+    "correct the objects of a run or a team: delete, rename, merge, split, pin, note, undo; name areas",
     "gausslite_objects.edit_command",
 )

@@ -1,86 +1,76 @@
-"""`gausslite edit`: correct the objects of a run: delete, rename, merge, pin, note, or undo an edit."""
+"""`gausslite edit`: correct the objects of a run or of a team, name areas, or undo an edit."""
 
 from __future__ import annotations
 
 import argparse
 import getpass
-import json
-import time
-from collections.abc import Sequence
-from pathlib import Path
 
-from gausslite.codec.json import object_from_json
 from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import ObjectLandmark
-from gausslite.mission.results import read_report
-from gausslite_objects.edits import Edit, EditKind, add_edit, apply_edits, read_edits
+from gausslite.wire.security import TlsFiles
+from gausslite_objects.areas import Area, Point
+from gausslite_objects.edits import EditKind
+from gausslite_objects.mapped_objects import open_memory
 
-_NEEDS_VALUE = (EditKind.RENAME, EditKind.MERGE, EditKind.NOTE)
+_LIST, _AREA, _NO_AREA = "list", "area", "no-area"
 
 
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite edit`."""
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="output folder of `map` or an agent")
-    parser.add_argument("kind", choices=[*map(str, EditKind), "list"], help="what to do; list: print the edits")
-    parser.add_argument(
+    add = parser.add_argument
+    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
+    kinds = [*map(str, EditKind), _AREA, _NO_AREA, _LIST]
+    add("kind", choices=kinds, help="what to do; area: name a polygon on the floor; list: print edits and areas")
+    add(
         "object",
         nargs="?",
         default="",
-        help="the object's id, as `gausslite objects RUN` prints it, or the number of the edit to undo",
+        help="the object's id, as `gausslite objects` prints it; the number of the edit to undo; the area's name",
     )
-    parser.add_argument(
-        "value",
-        nargs="?",
-        default="",
-        help="the new noun, the note, or the id of the object that is merged into this one",
+    add(
+        "values",
+        nargs="*",
+        metavar="VALUE",
+        help="the new noun, the note, the id of the object that is merged into this one, where to split (x=1.25; "
+        "without it the middle of the longest side), or the corners X,Y,Z of the area, after -- if one is negative",
     )
-    parser.add_argument("--author", default=getpass.getuser(), help="who edits (default: %(default)s)")
+    add("--author", default=getpass.getuser(), help="who edits (default: %(default)s)")
+    add_flags(parser, TlsFiles)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Edit, and print what was done. Returns the exit code."""
-    if options.kind == "list":
-        for number, edit in enumerate(read_edits(options.run_folder), 1):
-            print(f"{number}: {_describe(edit)}")
-        return 0
-    edit = edit_of(options.run_folder, EditKind(options.kind), options.object, options.value, options.author)
-    print(f"{add_edit(options.run_folder, edit)}: {_describe(edit)}")
+    memory = open_memory(options.place, build(TlsFiles, options).read())
+    if options.kind == _LIST:
+        for entry in memory.edits():
+            print(entry.describe())
+        for area in memory.areas():
+            print(_describe(area))
+    elif options.kind == _AREA:
+        area = Area(options.object, tuple(map(_corner, options.values)))
+        memory.set_area(area)
+        print(_describe(area))
+    elif options.kind == _NO_AREA:
+        memory.remove_area(options.object)
+        print(f"area {quote_name(options.object)}: removed")
+    else:
+        value = " ".join(options.values)
+        print(memory.edit(EditKind(options.kind), options.object, value, options.author).describe())
     return 0
 
 
-def edit_of(folder: Path, kind: EditKind, object_id: str, value: str, author: str) -> Edit:
-    """Return an edit of an object of a run, as it is after the earlier edits. Raises InvalidInputError."""
-    now_ns = time.time_ns()
-    if kind is EditKind.UNDO:
-        return Edit(kind, author, now_ns, value=object_id)
-    if kind in _NEEDS_VALUE and not value:
-        raise InvalidInputError(f"{kind} {quote_name(object_id)}: expected a value, got none")
-    objects = apply_edits(reported_objects(folder), read_edits(folder)).objects
-    target = _with_id(objects, object_id)
-    other = _with_id(objects, value) if kind is EditKind.MERGE else None
-    return Edit(kind, author, now_ns, target, value, other)
+def _describe(area: Area) -> str:
+    corners = " ".join("({:.2f}, {:.2f}, {:.2f})".format(*corner) for corner in area.corners_m)
+    return f"area {quote_name(area.name)}: {corners} m"
 
 
-def reported_objects(folder: Path) -> list[ObjectLandmark]:
-    """Return the objects in a run's report.json, before edits. Raises InvalidInputError, CodecError."""
-    values = read_report(folder).get("objects")
-    if not isinstance(values, list):
-        raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
-    return [object_from_json(value) for value in values]
-
-
-def _with_id(objects: Sequence[ObjectLandmark], object_id: str) -> ObjectLandmark:
-    for landmark in objects:
-        if landmark.object_id == object_id:
-            return landmark
-    known = ", ".join(landmark.object_id for landmark in objects[:20]) or "none"
-    raise InvalidInputError(f"object: expected one of {known}, got {quote_name(object_id)}")
-
-
-def _describe(edit: Edit) -> str:
-    what = edit.value if edit.target is None else json.dumps(edit.target.object_id)
-    to = f" as {quote_name(edit.value)}" if edit.target is not None and edit.value else ""
-    return f"{edit.kind} {what}{to}, by {edit.author}"
+def _corner(text: str) -> Point:
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        raise InvalidInputError(f"area: expected corners X,Y,Z in metres, got {quote_name(text)}") from None
+    return x, y, z

@@ -1,4 +1,4 @@
-"""What people said of objects: deleted, renamed, merged, pinned or noted. An edit names a place, so it outlives ids.
+"""What people said of objects: deleted, renamed, merged, split, pinned, noted. An edit names a place: it outlives ids.
 
 Edits are kept in the order in which they were made, each with its author and time. They win over detections, earlier
 and later ones, until another edit undoes them.
@@ -19,7 +19,7 @@ from gausslite.codec.json import object_as_json, object_from_json
 from gausslite.codec.state_file import write_atomic
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import CodecError, InvalidInputError, MapFileError
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import ObjectLandmark, TeamObject
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.mission.results import read_report
 
@@ -28,6 +28,8 @@ _FILE, CARRIED = "object_edits.json", "object_edits"
 _NONE: dict[str, list[Any]] = {"edits": []}
 _OBJECTS = ("target", "other")
 _MAX_EDITS = 1000
+_AXES = ("x", "y", "z")
+_LEAST_PART_M = 0.01
 _MARGIN_M = 0.1
 """An object is the edited one if its centre is in the edited one's box or within this of it."""
 
@@ -38,6 +40,7 @@ class EditKind(StrEnum):
     DELETE = "delete"
     RENAME = "rename"
     MERGE = "merge"
+    SPLIT = "split"
     PIN = "pin"
     NOTE = "note"
     UNDO = "undo"
@@ -45,7 +48,8 @@ class EditKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """One edit of an object as it was then. value: the new noun, the note, or the number of the edit to undo.
+    """One edit of an object as it was then. value: the new noun, the note, the number of the edit to undo, or where an
+    object is split: an axis and a place, as "x=1.25"; empty for the middle of its longest side.
 
     other: the object that is merged into it. Raises InvalidInputError.
     """
@@ -65,10 +69,31 @@ class Edit:
             require_name(f"{self.kind} value", self.value)
             if not self.value.strip():
                 raise InvalidInputError(f"{self.kind}: expected a text, got an empty one")
+        if self.kind is EditKind.SPLIT and self.target is not None and len(self.halves(self.target)) < 2:
+            box = self.target.extent_m
+            raise InvalidInputError(
+                f"split {self.target.object_id}: expected a place inside its box {box.min_m} to {box.max_m}, "
+                f"got {quote_name(self.value)}"
+            )
 
     def concerns(self, landmark: ObjectLandmark) -> bool:
         """Return True if an object is the edited one: the same noun, in its place."""
         return self.target is not None and _is_same(self.target, landmark)
+
+    def halves(self, landmark: ObjectLandmark) -> list[ObjectLandmark]:
+        """Return the parts of an object on both sides of the cut; the object if the cut does not go through it."""
+        assert self.target is not None
+        axis, at_m = _cut(self.value, self.target)
+        low_m, high_m = list(landmark.extent_m.min_m), list(landmark.extent_m.max_m)
+        if not low_m[axis] + _LEAST_PART_M <= at_m <= high_m[axis] - _LEAST_PART_M:
+            return [landmark]
+        parts = []
+        for side_m, cut_m in ((low_m, [*high_m]), (high_m, [*low_m])):
+            cut_m[axis] = at_m
+            x, y, z = (0.5 * (at_m + side_m[i]) if i == axis else own for i, own in enumerate(landmark.centroid_m))
+            box = AxisAlignedBox.around(np.array([side_m, cut_m]))
+            parts.append(replace(landmark, centroid_m=(x, y, z), extent_m=box))
+        return parts
 
     def as_json(self) -> dict[str, Any]:
         """Return the edit as JSON values."""
@@ -89,17 +114,19 @@ class Edit:
 
 @dataclass(frozen=True, slots=True)
 class EditedObjects:
-    """Objects after all edits; notes and pinned by their ids."""
+    """Objects after all edits; notes, pinned and parts by their ids. parts: the ids of which an object consists."""
 
     objects: tuple[ObjectLandmark, ...]
     notes: Mapping[str, tuple[str, ...]]
     pinned: frozenset[str]
+    parts: Mapping[str, tuple[str, ...]]
 
 
 def apply_edits(objects: Iterable[ObjectLandmark], edits: Sequence[Edit]) -> EditedObjects:
     """Return the objects that a person would see: each edit in its order, without those undone."""
     left, pinned = list(objects), set[str]()
     notes: dict[str, tuple[str, ...]] = {}
+    parts: dict[str, tuple[str, ...]] = {landmark.object_id: (landmark.object_id,) for landmark in left}
     for edit in effective(edits):
         assert edit.target is not None
         found = [landmark for landmark in left if edit.concerns(landmark)]
@@ -111,15 +138,24 @@ def apply_edits(objects: Iterable[ObjectLandmark], edits: Sequence[Edit]) -> Edi
             found += [mark for mark in left if mark not in found and _is_same(edit.other, mark)]
             rest = [landmark for landmark in left if landmark not in found]
             left = [*rest, _merged(found)] if found else rest
+            for landmark in found[:1]:
+                parts[landmark.object_id] = tuple(own for mark in found for own in parts[mark.object_id])
+        elif edit.kind is EditKind.SPLIT:
+            for mark in found:
+                first, *others = edit.halves(mark)
+                others = [replace(half, object_id=_free_id(half, left, "-half")) for half in others]
+                left = [half for own in left for half in ((first, *others) if own is mark else (own,))]
+                parts |= {half.object_id: parts[mark.object_id] for half in others}
         elif edit.kind is EditKind.PIN:
             if not found:
-                found = [replace(edit.target, confidence=1.0, object_id=_free_id(edit.target, left))]
+                found = [replace(edit.target, confidence=1.0, object_id=_free_id(edit.target, left, "-pinned"))]
                 left += found
+                parts[found[0].object_id] = ()
             pinned |= {landmark.object_id for landmark in found}
         else:
             for landmark in found:
                 notes[landmark.object_id] = (*notes.get(landmark.object_id, ()), f"{edit.author}: {edit.value}")
-    return EditedObjects(tuple(left), notes, frozenset(pinned))
+    return EditedObjects(tuple(left), notes, frozenset(pinned), parts)
 
 
 def effective(edits: Sequence[Edit]) -> list[Edit]:
@@ -135,28 +171,45 @@ def read_edits(folder: Path) -> tuple[Edit, ...]:
     """Return the edits of a run's folder, oldest first, or those of the map that it continues. Raises MapFileError."""
     path = folder / _FILE
     try:
-        content: Any = json.loads(path.read_bytes()) if path.exists() else read_report(folder).get(CARRIED, _NONE)
-        return tuple(map(Edit.from_json, content["edits"]))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, CodecError) as error:
+        data = path.read_bytes() if path.exists() else json.dumps(read_report(folder).get(CARRIED, _NONE)).encode()
+        return decode_edits(data)
+    except (OSError, CodecError) as error:
         raise MapFileError(f"{path}: expected the edits of objects, got an unreadable file: {error}") from error
-
-
-def add_edit(folder: Path, edit: Edit) -> int:
-    """Append an edit to a run's folder, durably, and return its number. Raises InvalidInputError, StorageError."""
-    edits = read_edits(folder)
-    if len(edits) >= _MAX_EDITS:
-        raise InvalidInputError(f"{folder}: expected at most {_MAX_EDITS} edits, got more")
-    if edit.kind is EditKind.UNDO and not (edit.value.isdecimal() and 1 <= int(edit.value) <= len(edits)):
-        raise InvalidInputError(
-            f"undo: expected the number of an edit, 1 to {len(edits)}, got {quote_name(edit.value)}"
-        )
-    write_edits(folder, (*edits, edit))
-    return len(edits) + 1
 
 
 def write_edits(folder: Path, edits: Sequence[Edit]) -> None:
     """Replace the edits of a run's folder in one step. Raises StorageError."""
-    write_atomic(folder / _FILE, (json.dumps(edits_as_json(edits), indent=1) + "\n").encode())
+    write_atomic(folder / _FILE, encode_edits(edits))
+
+
+def encode_edits(edits: Iterable[Edit]) -> bytes:
+    """Return edits as a file."""
+    return (json.dumps(edits_as_json(edits), indent=1) + "\n").encode()
+
+
+def decode_edits(data: bytes) -> tuple[Edit, ...]:
+    """Return the edits of `encode_edits`; none of an empty file. Raises CodecError."""
+    try:
+        content: Any = json.loads(data) if data else _NONE
+        return tuple(map(Edit.from_json, content["edits"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CodecError(f"edits: expected the JSON of edits, got other bytes ({error})") from error
+
+
+def require_room(edits: Sequence[Edit]) -> None:
+    """Raise InvalidInputError if there are too many edits for another one."""
+    if len(edits) >= _MAX_EDITS:
+        raise InvalidInputError(f"edits: expected at most {_MAX_EDITS}, got more")
+
+
+def edit_team(objects: Sequence[TeamObject], edits: Sequence[Edit]) -> tuple[tuple[TeamObject, ...], EditedObjects]:
+    """Return a team's objects after all edits, with the observers of all their parts, and what people said of them."""
+    observers = {found.landmark.object_id: found.observers for found in objects}
+    edited = apply_edits([found.landmark for found in objects], edits)
+    return tuple(
+        TeamObject(landmark, tuple(seen for part in edited.parts[landmark.object_id] for seen in observers[part]))
+        for landmark in edited.objects
+    ), edited
 
 
 def edits_as_json(edits: Iterable[Edit]) -> dict[str, Any]:
@@ -166,6 +219,20 @@ def edits_as_json(edits: Iterable[Edit]) -> dict[str, Any]:
 
 def _is_same(known: ObjectLandmark, landmark: ObjectLandmark) -> bool:
     return known.noun == landmark.noun and known.distance_m(landmark.centroid_m) <= _MARGIN_M
+
+
+def _cut(value: str, landmark: ObjectLandmark) -> tuple[int, float]:
+    """Return the axis and the place of a cut. Raises InvalidInputError."""
+    if not value:
+        axis = int(np.argmax(landmark.size_m))
+        return axis, 0.5 * (landmark.extent_m.min_m[axis] + landmark.extent_m.max_m[axis])
+    name, _, place = value.partition("=")
+    try:
+        return _AXES.index(name), float(place)
+    except ValueError:
+        raise InvalidInputError(
+            f"split: expected an axis and a place in metres, as x=1.25, got {quote_name(value)}"
+        ) from None
 
 
 def _merged(objects: Sequence[ObjectLandmark]) -> ObjectLandmark:
@@ -182,8 +249,8 @@ def _merged(objects: Sequence[ObjectLandmark]) -> ObjectLandmark:
     )
 
 
-def _free_id(landmark: ObjectLandmark, objects: Iterable[ObjectLandmark]) -> str:
+def _free_id(landmark: ObjectLandmark, objects: Iterable[ObjectLandmark], suffix: str) -> str:
     taken, object_id = {other.object_id for other in objects}, landmark.object_id
     while object_id in taken:
-        object_id += "-pinned"
+        object_id += suffix
     return object_id

@@ -22,16 +22,17 @@ from gausslite.mission.results import MAP, TRAJECTORY, read_report, stated_up
 from gausslite.plugins import Group, load
 from gausslite.wire.security import Tls
 from gausslite_language.rules import RuleParser
-from gausslite_objects.edit_command import reported_objects
+from gausslite_objects.areas import Area, NamedPlaces, read_areas
 from gausslite_objects.edits import EditedObjects, apply_edits, read_edits
 from gausslite_objects.life import Life, life_of
+from gausslite_objects.object_memory import ObjectMemory, RunMemory, reported_objects
 from gausslite_objects.team_objects import merge_objects
 from gausslite_objects.visit import Visit, depth_views, read_depths
 
 
 @dataclass(frozen=True, slots=True)
 class MappedObjects:
-    """The objects of a map, with notes; of a folder also their lives and edits, and its last camera pose."""
+    """The objects of a map after edits, its areas, and notes; of a folder also lives, and its last camera pose."""
 
     objects: Sequence[TeamObject]
     up_axis: UpAxis = (0.0, 0.0, 1.0)
@@ -39,6 +40,7 @@ class MappedObjects:
     edited: EditedObjects = field(default_factory=lambda: apply_edits((), ()))
     T_world_camera: Float64[ndarray, "4 4"] | None = None
     notes: tuple[str, ...] = ()
+    areas: tuple[Area, ...] = ()
 
 
 def query(address: str, tls: Tls | None) -> MappedObjects:
@@ -46,12 +48,18 @@ def query(address: str, tls: Tls | None) -> MappedObjects:
     # imported late, because the objects of a folder need no gRPC
     from gausslite.wire.channel import require_callable
     from gausslite.wire.clients import FusionClient
+    from gausslite_objects.memory_client import ServerMemory
 
     require_callable("a fusion server or the output folder of a run", address)
     with FusionClient(address, tls=tls) as client:
         left_out = client.unlocalised()
         notes = tuple(f"the objects of {agent_id} are left out; {reason}" for agent_id, reason in left_out.items())
-        return MappedObjects(client.query_objects(), notes=notes)
+        objects = client.query_objects()
+        remarks, areas = ServerMemory(address, tls).remarks()
+    said = {name: own.notes for name, own in remarks.items()}
+    pinned = frozenset(name for name, own in remarks.items() if own.is_pinned)
+    edited = EditedObjects(tuple(found.landmark for found in objects), said, pinned, {})
+    return MappedObjects(objects, edited=edited, notes=notes, areas=areas)
 
 
 def read_folder(folder: Path) -> MappedObjects:
@@ -70,20 +78,38 @@ def read_folder(folder: Path) -> MappedObjects:
         _lives(folder, edited.objects),
         edited,
         poses[-1] if len(poses) else None,
+        areas=read_areas(folder),
     )
 
 
+def open_memory(place: str, tls: Tls | None = None) -> ObjectMemory:
+    """Return the memory of a run's folder or of a fusion server at HOST:PORT. Raises InvalidInputError."""
+    if Path(place).is_dir():
+        return RunMemory(Path(place))
+    # imported late, because the objects of a folder need no gRPC
+    from gausslite.wire.channel import require_callable
+    from gausslite_objects.memory_client import ServerMemory
+
+    require_callable("a fusion server or the output folder of a run", place)
+    return ServerMemory(place, tls)
+
+
 def select(place: MappedObjects, question: str) -> tuple[Sequence[TeamObject], Sequence[str]]:
-    """Return the objects that a noun or a question means, with notes. Raises InvalidInputError, TaskError."""
-    if not question:
-        return place.objects, ()
+    """Return the objects that a noun or a question means, with notes; of areas that it names, only those there.
+
+    Raises InvalidInputError, TaskError.
+    """
+    named = NamedPlaces.of(question, place.areas)
+    objects = [found for found in place.objects if named.contain(found.landmark.centroid_m, place.up_axis)]
+    if not named.question:
+        return objects, ()
     try:
-        graph = RuleParser().parse(question)
+        graph = RuleParser().parse(named.question)
     except TaskError as error:
         raise InvalidInputError(f"QUESTION: {error}") from error
-    by_id = {team_object.landmark.object_id: team_object for team_object in place.objects}
+    by_id = {team_object.landmark.object_id: team_object for team_object in objects}
     answer: Callable[..., Answer] = load(Group.QUESTIONS, purpose="questions")
-    found = answer(graph, [team_object.landmark for team_object in place.objects], place.up_axis, place.T_world_camera)
+    found = answer(graph, [team_object.landmark for team_object in objects], place.up_axis, place.T_world_camera)
     return [by_id[landmark.object_id] for landmark in found.objects], found.notes
 
 

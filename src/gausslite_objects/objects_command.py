@@ -78,7 +78,7 @@ def _describe(team_object: TeamObject, place: MappedObjects) -> str:
     )
     return (
         f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({centre}) m, size {size} m, "
-        f"confidence {landmark.confidence:.2f}, seen by {seen}{_state(landmark, place)}"
+        f"confidence {landmark.confidence:.2f}, seen by {seen or 'nobody now'}{_state(landmark, place)}"
     )
 
 

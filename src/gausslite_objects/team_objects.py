@@ -35,6 +35,7 @@ from gausslite.domain.task import noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.store import FusionStore
 from gausslite.nouns import same_kind
+from gausslite_objects.edits import Edit, apply_edits, decode_edits, edit_team
 
 _MIN_MATCH_DISTANCE_M = 0.15
 _MATCH_DISTANCE_SHARE = 0.5
@@ -243,7 +244,7 @@ def _merge_landmarks(landmarks: Sequence[ObjectLandmark]) -> ObjectLandmark:
     )
 
 
-_IDS_RECORD = "object-ids"
+_IDS_RECORD, EDITS_RECORD = "object-ids", "object-edits"
 _MAX_NOUN_BYTES = MAX_NAME_BYTES - 32
 
 
@@ -303,8 +304,10 @@ class MergedObjects:
     """
 
     def __init__(self, store: FusionStore) -> None:
-        """The store keeps the objects' ids."""
-        self._ids = TeamObjectIds(store)
+        """The store keeps the objects' ids and edits. edited: what people said of the objects that were found last."""
+        self._ids, self._store = TeamObjectIds(store), store
+        self._edits: tuple[bytes, tuple[Edit, ...]] = b"", ()
+        self.edited = apply_edits((), ())
         # held while reports are merged, so that many queries at once merge once
         self._lock = Lock()
         self._of: tuple[dict[str, ObjectReport], dict[str, bytes]] = {}, {}
@@ -329,8 +332,12 @@ class MergedObjects:
     def find(
         self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]], noun: str
     ) -> tuple[TeamObject, ...]:
-        """Return those of `of` that a noun names, or all. Raises InvalidInputError."""
-        return find_objects(self.of(reports, frames), noun)
+        """Return those of `of` that a noun names, or all, after the edits in the store. Raises InvalidInputError."""
+        data = self._store.find_record("", EDITS_RECORD)
+        if data != self._edits[0]:
+            self._edits = data, decode_edits(data)
+        objects, self.edited = edit_team(self.of(reports, frames), self._edits[1])
+        return find_objects(objects, noun)
 
 
 def find_objects(objects: Sequence[TeamObject], noun: str = "") -> tuple[TeamObject, ...]:

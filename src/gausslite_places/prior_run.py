@@ -24,6 +24,7 @@ from gausslite.mission.prior_map import PRIOR_FOLDER, MapChanges, PriorMap
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.map_viewer import view_map
+from gausslite_objects.areas import CARRIED_AREAS, read_areas
 from gausslite_objects.changes import Change, compare_visits, with_earlier_objects
 from gausslite_objects.edits import CARRIED, edits_as_json, read_edits
 from gausslite_objects.visit import Visit
@@ -101,11 +102,12 @@ class PriorRun(PriorMap):
         if self.motion is not None:
             changes = compare_visits(self.saved.visit(), _visit(gaussians, objects, keyframes))
             objects = with_earlier_objects(objects, self.saved.objects, changes)
-        edits = () if self.motion is None else read_edits(self.saved.folder)
+        folder = None if self.motion is None else self.saved.folder
         report = {
             "prior": self._report(),
             "changes": [change.as_json() for change in changes],
-            CARRIED: edits_as_json(edits),
+            CARRIED: edits_as_json(() if folder is None else read_edits(folder)),
+            CARRIED_AREAS: [] if folder is None else [area.as_json() for area in read_areas(folder)],
         }
         return MapChanges(objects, tuple(map(Change.describe, changes)), report)
 

@@ -12,9 +12,11 @@ from gausslite.process import size_text
 from gausslite.wire.clients import Export, FusionClient
 from gausslite_evaluation.compare import map_purpose
 from gausslite_link.map_follower import MapFollower
+from gausslite_objects.object_memory import ObjectMemory
 from gausslite_view.cameras import TeamCameras, TeamKeyframes
 from gausslite_view.contents import ViewContents, followed_contents
 from gausslite_view.map_page import MapPage, text_html
+from gausslite_view.objects_panel import ObjectsPanel
 from gausslite_view.plots import TeamPlots
 
 _FUSED, _REFINED = "fused map", "refined map"
@@ -25,7 +27,7 @@ _NS_PER_S = 1e9
 class FusionPanel:
     """Owns the page's content while it follows one fusion server. `poll` is called on one thread."""
 
-    def __init__(self, page: MapPage, client: FusionClient) -> None:
+    def __init__(self, page: MapPage, client: FusionClient, memory: ObjectMemory) -> None:
         self._page, self._client = page, client
         self._follower = MapFollower(client.watch)
         self._started_s = time.monotonic()
@@ -37,6 +39,7 @@ class FusionPanel:
             self._status = gui.add_html("")
             self._refine = gui.add_button("Start refinement")
             self._message = gui.add_html("")
+        self.objects = ObjectsPanel(page, memory, self._draw_again)
         self._keyframes, self._cameras = TeamKeyframes(client), TeamCameras(page, client)
         with gui.add_folder("History", expand_by_default=False):
             self._plots = TeamPlots(gui, client)
@@ -66,6 +69,7 @@ class FusionPanel:
         self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
         targets = {agent.agent_id: tuple(agent.targets) for agent in status.agents}
         objects = tuple(team_object.landmark for team_object in self._client.query_objects())
+        self.objects.show(objects)
         state_ns = round(time_s * _NS_PER_S)
         paths = self._keyframes.paths()
         fused = replace(followed_contents(followed, targets), objects=objects, paths=paths, state_ns=state_ns)
@@ -93,6 +97,9 @@ class FusionPanel:
         """Close the client and end the follower."""
         self._client.close()
         self._follower.close()
+
+    def _draw_again(self) -> None:
+        self._shown = None
 
     def _download(self, layer: str, targets: dict[str, tuple[str, ...]], fused: ViewContents) -> ViewContents:
         """Return the refined map, or all that one agent has sent, in place of the fused one."""

@@ -100,7 +100,12 @@ _CLEAR = 0.7
 """Around the start view's camera, within this share of the way to its focus, no marker of a camera is drawn."""
 _MAX_TRAJECTORY_POINTS = 5000
 _TRAJECTORY_RGB, _KEYFRAME_RGB, _ROBOT_RGB = (40, 90, 220), (90, 140, 230), (220, 40, 40)
-_TARGET_RGB, _ANCHOR_RGB = (20, 150, 60), (200, 130, 20)
+_BOX_STYLES = {
+    ObjectRole.TARGET: ((20, 150, 60), 0.004),
+    ObjectRole.ANCHOR: ((200, 130, 20), 0.002),
+    ObjectRole.OTHER: ((130, 130, 130), 0.001),
+}
+"""Colour of a box's lines, and their thickness in metres."""
 _MIN_BOX_M = 0.01
 _EDGES = [pair for pair in combinations(range(8), 2) if (pair[0] ^ pair[1]).bit_count() == 1]
 """The pairs of a box's corners that differ along one side."""
@@ -216,8 +221,7 @@ class SceneMarkers:
         self, index: int, landmark: ObjectLandmark, box: OrientedBox, label_m: Float64[ndarray, "3"]
     ) -> list[Any]:
         """Draw an object's box and its name, with a line between them if the name had to move up."""
-        is_target = landmark.role is ObjectRole.TARGET
-        colour, thickness_m = (_TARGET_RGB, 0.004) if is_target else (_ANCHOR_RGB, 0.002)
+        colour, thickness_m = _BOX_STYLES[landmark.role]
         corners_m = replace(box, size_m=tuple(np.maximum(box.size_m, _MIN_BOX_M).tolist())).corners_m
         scene, name = self._server.scene, f"/objects/{index}"
         inside_m = np.clip(label_m, corners_m.min(axis=0), corners_m.max(axis=0))

@@ -13,6 +13,8 @@ from gausslite.process import import_extra
 from gausslite.wire.channel import UNIX, host_and_port, require_callable
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.security import Tls
+from gausslite_objects.mapped_objects import open_memory
+from gausslite_objects.object_memory import ObjectMemory
 from gausslite_view.contents import DEFAULT_LIMIT
 
 if TYPE_CHECKING:
@@ -58,7 +60,8 @@ def live_page(
             return AgentClient(address, _DEADLINE_S, tls)
         return FusionClient(address, _DEADLINE_S, tls=tls)
 
-    follower = threading.Thread(target=_follow, args=(page, open_client, stopped), daemon=True)
+    memory = open_memory(address, tls)
+    follower = threading.Thread(target=_follow, args=(page, open_client, memory, stopped), daemon=True)
     follower.start()
     try:
         yield page.url
@@ -86,12 +89,17 @@ def own_address(listen: str) -> str:
     return f"localhost:{port}" if host in _ANY_HOST else listen
 
 
-def _follow(page: MapPage, open_client: Callable[[], AgentClient | FusionClient], stopped: threading.Event) -> None:
+def _follow(
+    page: MapPage,
+    open_client: Callable[[], AgentClient | FusionClient],
+    memory: ObjectMemory,
+    stopped: threading.Event,
+) -> None:
     from gausslite_view.agent_panel import AgentPanel
     from gausslite_view.fusion_panel import FusionPanel
 
     client = open_client()
-    panel = AgentPanel(page, client) if isinstance(client, AgentClient) else FusionPanel(page, client)
+    panel = AgentPanel(page, client) if isinstance(client, AgentClient) else FusionPanel(page, client, memory)
     poll: Callable[[], None] = panel.poll
     try:
         while not stopped.wait(_POLL_S):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.codec.json import object_from_json
 from gausslite.codec.ply import read_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.datasets.pose_track import read_pose_rows
@@ -17,6 +16,8 @@ from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import TRAJECTORY, read_report
 from gausslite.process import print_message
+from gausslite_objects.edits import apply_edits, read_edits
+from gausslite_objects.object_memory import reported_objects
 from gausslite_view.contents import NO_AGENT, ViewContents
 from gausslite_view.map_history import MapSnapshot, read_map_history
 from gausslite_view.time_scrub import PastMap
@@ -38,7 +39,7 @@ def read_contents(path: Path) -> ViewContents:
     report = read_report(path)
     contents = ViewContents.of_one_agent(gaussians, str(report.get("agent_id") or path.resolve().name))
     contents = replace(
-        contents, targets=_targets(report), objects=_objects(report), keyframes=tuple(read_keyframe_views(path))
+        contents, targets=_targets(report), objects=edited_objects(path), keyframes=tuple(read_keyframe_views(path))
     )
     if not (path / TRAJECTORY).is_file():
         return contents
@@ -77,6 +78,8 @@ def _targets(report: Mapping[str, object]) -> tuple[str, ...]:
     return tuple(str(target) for target in targets) if isinstance(targets, list) else ()
 
 
-def _objects(report: Mapping[str, object]) -> tuple[ObjectLandmark, ...]:
-    values = report.get("objects")
-    return tuple(object_from_json(value) for value in values) if isinstance(values, list) else ()
+def edited_objects(folder: Path) -> tuple[ObjectLandmark, ...]:
+    """Return the objects of a run after edits; none of a run without any. Raises MapFileError, CodecError."""
+    if not isinstance(read_report(folder).get("objects"), list):
+        return ()
+    return apply_edits(reported_objects(folder), read_edits(folder)).objects

@@ -7,7 +7,9 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gausslite.config.command_parser import CommandParser, bounded
 from gausslite.config.option import build
@@ -15,9 +17,13 @@ from gausslite.config.program import add_flags
 from gausslite.mission.results import read_report
 from gausslite.process import print_message
 from gausslite.wire.security import TlsFiles
-from gausslite_view.contents import DEFAULT_LIMIT
+from gausslite_objects.object_memory import RunMemory
+from gausslite_view.contents import DEFAULT_LIMIT, ViewContents
 from gausslite_view.pages import open_page
-from gausslite_view.run_contents import read_contents, read_past
+from gausslite_view.run_contents import edited_objects, read_contents, read_past
+
+if TYPE_CHECKING:
+    from gausslite_view.map_page import MapPage
 
 _DEFAULT_PORT = 8099
 
@@ -70,9 +76,24 @@ def show_files(options: argparse.Namespace) -> Iterator[str]:
     page = open_page(options.port, f"GaussLite {path.resolve().name}", options.max_shown)
     try:
         page.show_run(contents, past)
+        if path.is_dir():
+            _add_objects(page, path, contents)
         yield page.url
     finally:
         page.close()
+
+
+def _add_objects(page: MapPage, folder: Path, contents: ViewContents) -> None:
+    """Let a person correct the run's objects."""
+    from gausslite_view.objects_panel import ObjectsPanel
+
+    def show() -> None:
+        objects = edited_objects(folder)
+        panel.show(objects)
+        page.show(replace(contents, objects=objects))
+
+    panel = ObjectsPanel(page, RunMemory(folder), show)
+    panel.show(contents.objects)
 
 
 @contextmanager

@@ -142,6 +142,18 @@ def test_a_generic_noun_matches_every_class(tmp_path):
     assert len(detector.detect(frame_with_red_square(), ["obstacle"])) == 2
 
 
+def test_everything_else_is_detected_by_its_class_beside_the_named_things_as_they_are(tmp_path):
+    boxes = [CUP, (20.0, 30.0, 10.0, 10.0, 1, 0.7), (28.0, 36.0, 8.0, 8.0, 0, 0.15)]
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, boxes))
+    frame = frame_with_red_square()
+    named = detector.detect(frame, ["cup"])
+    both = detector.detect(frame, ["cup", "object"])
+    assert [(each.score, each.box_px) for each in both if each.phrase == "cup"] == [
+        (each.score, each.box_px) for each in named
+    ]
+    assert {each.class_name for each in both if each.phrase == "object"} == {"cup", "chair"}
+
+
 def test_a_noun_without_a_class_is_unsupported(tmp_path):
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []

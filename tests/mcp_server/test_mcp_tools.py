@@ -30,6 +30,9 @@ from gausslite_mcp.command import read_tokens
 from gausslite_mcp.place import open_place
 from gausslite_mcp.server import build_server
 from gausslite_mcp.tools import PlaceTools
+from gausslite_objects.areas import Area
+from gausslite_objects.edits import EditKind
+from gausslite_objects.object_memory import RunMemory
 
 EYES_M = [(1.0, -1.6, 1.0), (2.2, 0.8, 1.6)]
 URL = "http://127.0.0.1:8000"
@@ -97,6 +100,34 @@ def test_errors_are_those_of_the_library(folder: Path) -> None:
         assert result.is_error
         assert message in result.content[0].text
         assert "Traceback" not in result.content[0].text
+
+
+def test_a_model_lists_areas_and_corrects_objects_for_everybody(tmp_path: Path) -> None:
+    room = write_room(tmp_path / "run", EYES_M)
+    corners = ((0.5, -1.0, 0.0), (2.0, -1.0, 0.0), (2.0, 1.0, 0.0), (0.5, 1.0, 0.0))
+    RunMemory(room).set_area(Area("dining corner", corners))
+    server = build_server(PlaceTools(open_place(str(room), threads=1)))
+    areas, inside, made, listed, undone, wrong = answers(
+        server,
+        ("list_areas", {}),
+        ("list_objects", {"question": "what is outside the dining corner"}),
+        ("edit_object", {"kind": "rename", "object": "cube", "value": "box"}),
+        ("list_objects", {}),
+        ("edit_object", {"kind": "undo", "object": "1"}),
+        ("edit_object", {"kind": "explode", "object": "cube"}),
+    )
+    assert [(area["name"], area["objects"]) for area in values(areas)["areas"]] == [
+        ("dining corner", ["cube-1", "table-2"])
+    ]
+    assert [found["id"] for found in values(inside)["objects"]] == ["lamp-3"]
+    assert (values(made)["edit"], values(undone)["edit"]) == (1, 2)
+    assert {found["noun"] for found in values(listed)["objects"]} == {"box", "table", "lamp"}
+    assert wrong.content[0].text.endswith(f"expected one of {', '.join(EditKind)}, got 'explode'")
+    assert all(entry.author.endswith(" by MCP") for entry in RunMemory(room).edits())
+    read_only = build_server(PlaceTools(open_place(str(room), threads=1)), may_change=False)
+    [refusal] = answers(read_only, ("edit_object", {"kind": "delete", "object": "cube"}))
+    assert "edit_object: expected the role operator, got viewer" in refusal.content[0].text
+    assert len(RunMemory(room).edits()) == 2
 
 
 def test_the_objects_and_the_map_of_a_server_are_those_of_now(fusion: RunningServer) -> None:

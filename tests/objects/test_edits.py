@@ -68,6 +68,15 @@ def test_a_pinned_object_stays_and_merged_ones_are_one(run: Path) -> None:
     assert (merged.object_id, merged.confidence) == (FOUND.object_id, 1.0)
 
 
+def test_a_split_object_is_two_also_when_it_is_found_again(run: Path) -> None:
+    _edit(run, "split", FOUND.object_id, "y=0.45")
+    left, right = _edited(run, replace(FOUND, object_id="mug-7")).objects
+    assert (left.object_id, right.object_id) == ("mug-7", "mug-7-half")
+    assert left.extent_m.max_m[1] == right.extent_m.min_m[1] == 0.45
+    assert left.centroid_m[1] < 0.45 < right.centroid_m[1]
+    assert _edited(run, left, right).objects == (left, right)
+
+
 def test_a_run_that_continues_an_edited_map_carries_its_edits(run: Path, tmp_path: Path) -> None:
     _edit(run, "delete", FOUND.object_id)
     following = write_run(tmp_path / "next", **{CARRIED: edits_as_json(read_edits(run))})
@@ -84,6 +93,8 @@ def test_a_run_that_continues_an_edited_map_carries_its_edits(run: Path, tmp_pat
         (("rename", FOUND.object_id, " "), "rename: expected a text"),
         (("merge", FOUND.object_id, "sofa-1"), "object: expected one of"),
         (("undo", "1"), "undo: expected the number of an edit, 1 to 0"),
+        (("split", FOUND.object_id, "x=99"), "expected a place inside its box"),
+        (("split", FOUND.object_id, "w=1"), "split: expected an axis and a place in metres, as x=1.25"),
     ],
 )
 def test_an_edit_of_nothing_is_refused(

@@ -44,6 +44,7 @@ from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.security import Tls
+from gausslite_fusion_server.plugins import added_services
 from gausslite_fusion_server.servicer import FusionServicer
 
 GRID = VoxelGrid(0.10)
@@ -102,7 +103,7 @@ def fusion_server(
     engine = FusionEngine(store or SqliteStore(), settings, decode_keyframe=decode_frame, aligner=aligner)
     settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
     servicer = FusionServicer(engine, settings_of_refinement, ReferenceRasterizer)
-    loops = []
+    loops, others = [], added_services(lambda: engine)
 
     def register(server: grpc.aio.Server) -> None:
         loops.append(asyncio.get_running_loop())
@@ -110,7 +111,7 @@ def fusion_server(
 
     try:
         with (
-            serving([replace(servicer.service(), register=register)], address, tls=tls) as running,
+            serving([replace(servicer.service(), register=register), *others], address, tls=tls) as running,
             FusionClient(running.address, tls=tls) as client,
             grpc.insecure_channel(running.address) as channel,
         ):

@@ -32,11 +32,7 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
-from gausslite.wire.convert import (
-    box_from_message,
-    live_frame_from_message,
-    transform_from_message,
-)
+from gausslite.wire.convert import box_from_message, live_frame_from_message, transform_from_message
 from gausslite.wire.convert_task import assigned_from_message, graph_to_message
 from gausslite.wire.map_changes import BLOCK_BYTES, EncodedPart, EncodedPartCache, Parts, encode_parts, follow
 from gausslite.wire.server import Service
@@ -151,12 +147,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     """Serves one robot. changes: notified after each change of the map."""
 
     def __init__(
-        self,
-        agent_id: str,
-        worker: MappingWorker,
-        mission: AgentMission,
-        parser: TaskParser,
-        changes: ChangeNotifier,
+        self, agent_id: str, worker: MappingWorker, mission: AgentMission, parser: TaskParser, changes: ChangeNotifier
     ) -> None:
         self._agent_id, self._worker, self._mission = agent_id, worker, mission
         self._parser, self._changes = parser, changes

@@ -17,7 +17,7 @@ from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, Refine
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements
-from gausslite.plugins import Group, load
+from gausslite.plugins import Group, installed, load
 from gausslite.render.rasterizer import Rendering
 from gausslite.wire.server import Service
 from gausslite_fusion_server.settings import ServerSettings
@@ -42,6 +42,11 @@ MetricsServer = Callable[[str, FindEngine, Acknowledgements, FindCounts | None],
 
 Raises InvalidInputError for another address, UnavailableError if it is in use.
 """
+
+
+def added_services(engine: FindEngine) -> list[Service]:
+    """Return what plug-ins of the group gausslite.server_services add to a server: each is a function of its engine."""
+    return [create(engine) for _, create in installed(Group.SERVER_SERVICES)]
 
 
 class MapRenderer(Protocol):

@@ -22,17 +22,20 @@ from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
-from gausslite_fusion_server.plugins import FindCounts, FindEngine, MetricsServer, database_of, open_store
+from gausslite_fusion_server.plugins import (
+    FindCounts,
+    FindEngine,
+    MetricsServer,
+    added_services,
+    database_of,
+    open_store,
+)
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import PROGRAM, FrameUse, ServerSettings, parse_arguments
 
 _log = logging.getLogger(__name__)
 _SWITCH_INTERVAL_S = 0.001  # Python's 5 ms would delay the event loop behind a thread that computes
-_COLLECTION_THRESHOLDS = (
-    2_000,
-    10,
-    100,
-)  # a full collection of a large map takes 0.1 s: make it rare
+_COLLECTION_THRESHOLDS = (2_000, 10, 100)  # a full collection of a large map takes 0.1 s: make it rare
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -113,9 +116,10 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             servicer.drain()
 
+    services = [servicer.service(), *added_services(lambda: engine)]
     with _metrics(settings, lambda: engine, engine.acknowledgements), _page(settings):
         await serve_until_stopped(
-            settings.listen, [servicer.service()], work_until_stopped, settings.tls, settings.limits, settings.health
+            settings.listen, services, work_until_stopped, settings.tls, settings.limits, settings.health
         )
 
 
@@ -124,7 +128,8 @@ async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
     assert isinstance(settings.store, str)
     async with database_of(settings.store).open_share(settings, settings.store, peer_address) as share:
         metrics = _metrics(settings, share.engine, share.acknowledgements, share.counts)
+        services = [*share.services, *added_services(share.engine)]
         with metrics, _page(settings):
             await serve_until_stopped(
-                settings.listen, share.services, share.run, settings.tls, settings.limits, settings.health
+                settings.listen, services, share.run, settings.tls, settings.limits, settings.health
             )

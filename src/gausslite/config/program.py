@@ -94,11 +94,7 @@ class Program:
         parser.set_defaults(**{PROGRAM: self})
 
     def read(
-        self,
-        parser: CommandParser,
-        parsed: Namespace,
-        environment: Mapping[str, str],
-        warn: Callable[[str], None],
+        self, parser: CommandParser, parsed: Namespace, environment: Mapping[str, str], warn: Callable[[str], None]
     ) -> Namespace:
         """Return the effective options of a parsed command line. Raises InvalidInputError.
 

@@ -177,6 +177,7 @@ class Detection:
     rival: Rival | None = None  # None without another class
     is_weak: bool = False
     is_exact: bool = False  # the mask is ground truth, not a network's
+    class_name: str = ""  # of the detector, empty if it has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +189,7 @@ class DetectedBox:
     box_px: tuple[float, float, float, float]  # left, top, right, bottom
     rival: Rival | None = None
     is_weak: bool = False
+    class_name: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

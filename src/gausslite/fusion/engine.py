@@ -95,7 +95,7 @@ class FusionEngine:
         self.traffic = traffic or TrafficLog()
         self.queue, self.members = UpdateQueue(), Membership(store, settings)
         self.keyframes = KeyframePool(store, settings.quotas, decode_keyframe)
-        self.objects, self._merged_objects = TeamObjects(store), open_merged_objects(store)
+        self.objects, self.merged_objects = TeamObjects(store), open_merged_objects(store)
         self.frames = FrameAlignments(store, are_compared=aligner is not None)
         frames = {name: alignment for name, (_, alignment) in self.frames.by_rank().items()}
         first = time.time_ns() // 1000 if first_revision is None else first_revision
@@ -334,7 +334,7 @@ class FusionEngine:
 
         Raises InvalidInputError, MissingPluginError without a plug-in that merges objects.
         """
-        merged: MergedObjects = self._merged_objects or load(Group.TEAM_OBJECTS, purpose="objects of a team")
+        merged: MergedObjects = self.merged_objects or load(Group.TEAM_OBJECTS, purpose="objects of a team")
         reports, unlocalised = self.objects.reports(), self.frames.unlocalised
         used = {name: report for name, report in reports.items() if name not in unlocalised}
         return merged.find(used, self.frames.transforms(), noun)

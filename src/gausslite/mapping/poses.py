@@ -13,14 +13,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame, FrameId
-from gausslite.domain.pose import (
-    CorrectionTrack,
-    PoseCorrection,
-    Trajectory,
-    inverse,
-    orthonormal,
-    require_rigid,
-)
+from gausslite.domain.pose import CorrectionTrack, PoseCorrection, Trajectory, inverse, orthonormal, require_rigid
 from gausslite.domain.state import State, get_array, get_counts, int_array
 
 _MAX_POSES = 20_000

@@ -6,10 +6,12 @@ import copy
 import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
 
 from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounMatch
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
@@ -126,6 +128,18 @@ def build_task_mapper(
     return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=tracker, monitor=monitor)
 
 
+class ObjectMemory(Detector, Protocol):
+    """A detector that also remembers what else it sees, over all tasks of a mission."""
+
+    def remember(self, estimator: RelevanceEstimator, /) -> RelevanceEstimator:
+        """Return an estimator that reports these objects after its own, and has them in its state."""
+        ...
+
+
+OpenMemory = Callable[[Detector, UpAxis], ObjectMemory]
+"""The default of the group gausslite.object_memories."""
+
+
 class EstimatorFactory:
     """Builds the relevance estimator of each task of a mission; all of them share the detector's network."""
 
@@ -141,11 +155,12 @@ class EstimatorFactory:
         self._scene = functools.cache(scene)
         self._detector = chosen_detector(perception)
         self._executor: ThreadPoolExecutor | None = None
+        self._memory: ObjectMemory | None = None
 
     def in_scene(self, scene: Callable[[], SceneInfo]) -> EstimatorFactory:
         """Return a factory with the same detector for another scene."""
         other = copy.copy(self)
-        other._scene = functools.cache(scene)
+        other._scene, other._memory = functools.cache(scene), None
         return other
 
     def require_detector(self) -> None:
@@ -168,10 +183,14 @@ class EstimatorFactory:
         evidence = EvidenceSettings.accept_similar() if self._perception.accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         detector = self._detector_or_truth(bool(graph.queries))
-        if self._detector is None or not self._perception.asynchronous:
-            return TaskRelevanceEstimator(graph, detector, settings)
-        self._executor = self._executor or ThreadPoolExecutor(1, "detector")
-        return AsyncRelevanceEstimator(graph, detector, self._executor, settings)
+        if self._memory is None and (remember := find(Group.OBJECT_MEMORIES)) is not None:
+            self._memory = remember(detector, settings.up_axis)
+        detector = self._memory or detector
+        estimator: RelevanceEstimator = TaskRelevanceEstimator(graph, detector, settings)
+        if self._detector is not None and self._perception.asynchronous:
+            self._executor = self._executor or ThreadPoolExecutor(1, "detector")
+            estimator = AsyncRelevanceEstimator(graph, detector, self._executor, settings)
+        return estimator if self._memory is None else self._memory.remember(estimator)
 
     def _detector_or_truth(self, is_needed: bool = True) -> Detector:
         if self._detector is not None:

@@ -122,11 +122,7 @@ class SavedRun:
 def save_run(path: Path, mapper: TaskMapper, config: ResumeConfig, last_index: int, extra: State | None = None) -> None:
     """Save a run whose last frame had this index, for its owner alone. Raises StorageError."""
     run: State = {"config": encode_text(json.dumps(config.sections)), "last_index": int_array(last_index)}
-    state = {
-        **add_prefix("run", run),
-        **add_prefix("mapper", mapper.state()),
-        **add_prefix("extra", extra or {}),
-    }
+    state = {**add_prefix("run", run), **add_prefix("mapper", mapper.state()), **add_prefix("extra", extra or {})}
     write_state(path, state, 0o600)
 
 

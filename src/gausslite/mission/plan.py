@@ -24,12 +24,7 @@ from gausslite.mapping.splat_table import require_memory
 from gausslite.mission.build import EstimatorFactory, build_task_mapper, open_monitor
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.prior_map import PriorMap, open_prior_map
-from gausslite.mission.recording import (
-    calibrate_with_messages,
-    open_for_mapping,
-    report_region_file,
-    selected_regions,
-)
+from gausslite.mission.recording import calibrate_with_messages, open_for_mapping, report_region_file, selected_regions
 from gausslite.mission.results import peak_rss_mib, prepare_folder
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionResult, MissionRunner
 from gausslite.mission.schedule import ScheduledTaskMapper, TaskSchedule

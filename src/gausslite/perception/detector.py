@@ -57,7 +57,7 @@ class RegionDetector:
                 if name not in masks:
                     masks[name] = self._regions[name].mask(frame)
                 if (box := bounding_box(masks[name])) is not None:
-                    found.append(Detection(query, 1.0, box, masks[name], is_exact=True))
+                    found.append(Detection(query, 1.0, box, masks[name], is_exact=True, class_name=name))
         return found
 
     def _names(self, query: str) -> tuple[str, ...]:

@@ -325,9 +325,7 @@ def snapped_to_edges(mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -
 
 
 def _guided_filter(
-    guide: Float32[ndarray, "h w 3"],
-    values: Float32[ndarray, "h w"],
-    wanted: Bool[ndarray, "h w"],
+    guide: Float32[ndarray, "h w 3"], values: Float32[ndarray, "h w"], wanted: Bool[ndarray, "h w"]
 ) -> Float32[ndarray, "h w"]:
     """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels."""
     window = _EDGE_WINDOW
@@ -349,11 +347,7 @@ def _guided_filter(
     return filtered
 
 
-def mask_votes(
-    mask: Bool[ndarray, "h w"],
-    frame: Frame,
-    siblings: Bool[ndarray, "h w"] | None = None,
-) -> SurfaceVotes:
+def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame, siblings: Bool[ndarray, "h w"] | None = None) -> SurfaceVotes:
     """Return the votes of a detected mask: inside for its pixels, outside for the other pixels around it.
 
     siblings: pixels of the frame's detections of the same noun. They never vote outside: adjacent objects of one noun

@@ -105,6 +105,8 @@ _METHODS = (
     ("Fusion", _ROBOT, _CONTRIBUTE),
     ("Fusion", _ANY, "WatchFusedMap GetKeyframe ExportFusedMap QueryObjects RenderView GetSessionStatus"),
     ("Fusion", _OPERATOR, "RefineFusedMap EvictAgent UnbanAgent"),
+    ("Memory", _OPERATOR, "EditObject SetArea"),
+    ("Memory", _ANY, "GetMemory"),
     ("Region", _SERVER, _SHARE),
 )
 ROLES_OF_METHOD: Final = {

@@ -11,7 +11,13 @@ from fusion_running import GRID, RunningServer, fusion_server, make_subset, requ
 from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, NotPermittedError
-from gausslite.v1 import agent_service_pb2, fusion_service_pb2, parser_service_pb2, region_service_pb2
+from gausslite.v1 import (
+    agent_service_pb2,
+    fusion_service_pb2,
+    memory_service_pb2,
+    parser_service_pb2,
+    region_service_pb2,
+)
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.security import ROLES_OF_METHOD, Caller, Role, require_role
 from gausslite_language.rules import RuleParser
@@ -29,7 +35,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_method_of_the_services_has_its_roles() -> None:
-    modules = (parser_service_pb2, agent_service_pb2, fusion_service_pb2, region_service_pb2)
+    modules = (parser_service_pb2, agent_service_pb2, fusion_service_pb2, memory_service_pb2, region_service_pb2)
     methods = {
         f"/{service.full_name}/{method.name}"
         for module in modules

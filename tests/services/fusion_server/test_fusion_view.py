@@ -24,6 +24,7 @@ from page_controls import SeenPage, control, images, plot, poll_until, text
 
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import encode_mask, frame_to_message
+from gausslite_objects.memory_client import ServerMemory
 from gausslite_view.decoding import stored_keyframe_from_message
 from gausslite_view.fusion_panel import FusionPanel
 
@@ -43,7 +44,7 @@ def test_the_page_shows_who_won_each_voxel_and_what_it_shows(fusion: RunningServ
     contribute(fusion, "a", "Pick up the mug", [0.0, 1.0], kappa=5)
     contribute(fusion, "b", "Find the chair", [1.0, 2.0], kappa=9)
     page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client)
+    panel = FusionPanel(page, client, ServerMemory(client.address))
     try:
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 3)
         fused = page.contents
@@ -67,7 +68,7 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one(fus
     assert fusion.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)]) == 2
     contribute(fusion, "b", "Find the chair", [1.0], kappa=9)
     page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client)
+    panel = FusionPanel(page, client, ServerMemory(client.address))
     try:
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 2)
         (shown,) = images(page)
@@ -92,7 +93,7 @@ def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality(fu
     session_b = fusion.client.join("b", GRID).session_id
     fusion.client.contribute_keyframes(session_b, [coloured_frame(5, 90)])
     page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client)
+    panel = FusionPanel(page, client, ServerMemory(client.address))
     try:
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == len(wall().gaussians) + 1)
         poll_until(panel.poll, lambda: len(page.contents.paths[0].keyframes) == 20)
@@ -119,7 +120,7 @@ def test_the_time_slider_shows_the_earlier_fused_map_and_keyframe(fusion: Runnin
     session = fusion.client.join("a", GRID).session_id
     assert fusion.client.contribute_keyframes(session, [coloured_frame(3, 40)]) == 1
     page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client)
+    panel = FusionPanel(page, client, ServerMemory(client.address))
     try:
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 1)
         contribute(fusion, "b", "Find the chair", [1.0, 2.0], kappa=9)
