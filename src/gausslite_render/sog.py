@@ -61,7 +61,8 @@ def _harmonics(
     require(meta["bands"] in (1, 2, 3), "harmonics of degree 1 to 3", meta["bands"])
     coefficients = COUNTS[meta["bands"]]
     entries = palette[:, : _PALETTE_COLUMNS * coefficients, :3].reshape(-1, coefficients, 3)
-    return _codebook(meta)[entries[labels[:, 0] + 256 * labels[:, 1]]].transpose(0, 2, 1)
+    coloured: Float32[ndarray, "n k 3"] = _codebook(meta)[entries[labels[:, 0] + 256 * labels[:, 1]]]
+    return coloured.transpose(0, 2, 1)
 
 
 def _codebook(meta: dict[str, Any]) -> Float32[ndarray, " 256"]:
@@ -76,6 +77,6 @@ def _image(data: bytes) -> UInt8[ndarray, "h w 4"]:
     require(kind == b"WEBPVP8L" and len(data) > 32, "lossless WebP images", kind)
     width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     require(width * height <= MAX_GAUSSIANS + (1 << 16), f"images of at most {MAX_GAUSSIANS} pixels", width * height)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     require(image is not None and image.shape[:2] == (height, width), "WebP images", "damaged ones")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA))
