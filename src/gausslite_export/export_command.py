@@ -18,15 +18,17 @@ from gausslite.render.map_viewer import view_map
 from gausslite_export.format import ExportSettings, Format, MapContent
 from gausslite_export.formats import MESH_VOXEL_M, VIDEO_S, read_map, upright
 from gausslite_export.occupancy import OccupancySettings
+from gausslite_export.splat_formats import SPZ_VERSION, SPZ_VERSIONS
 
 _OCCUPANCY = OccupancySettings()
+_OPTIONS = ("voxel", "min_opacity", "seconds", "spz_version")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite export`."""
     add = parser.add_argument
     formats = "; ".join(f"{name}: {chosen.summary} ({chosen.suffix})" for name, chosen in installed(Group.EXPORTERS))
-    add("map", metavar="RUN", type=Path, help="a results folder of `gausslite map`, or a PLY file")
+    add("map", metavar="RUN", type=Path, help="a results folder of `gausslite map`, or a splat file")
     add("--to", metavar="FORMAT", choices=names(Group.EXPORTERS), required=True, help=formats)
     add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")
     add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
@@ -35,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     opacity_help = f"for octomap and nav2 (default: {_OCCUPANCY.min_opacity:g})"
     add("--min-opacity", metavar="A", type=bounded(float, 0, 1), help=opacity_help)
     add("--seconds", metavar="S", type=bounded(float, 0.1, 600), help=f"length of a video (default: {VIDEO_S:g})")
+    add("--spz-version", metavar="N", type=int, choices=SPZ_VERSIONS, help=f"2, 3 or 4 (default: {SPZ_VERSION})")
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
@@ -56,7 +59,8 @@ def run(options: argparse.Namespace) -> int:
     content = read_map(options.map, region, report, chosen.max_extent_m)
     content = upright(content) if chosen.is_upright else content
     prepare_folder(out.absolute().parent)
-    settings = ExportSettings(view_map, _with_progress, options.voxel, options.min_opacity, options.seconds)
+    values = (getattr(options, option) for option in _OPTIONS)
+    settings = ExportSettings(view_map, _with_progress, *values)
     chosen.write(out, content, settings)
     _report(options, chosen, content, out, "of the task's region" if region == "roi" else "of the map")
     return 0
@@ -80,7 +84,7 @@ def _report(options: argparse.Namespace, chosen: Format, content: MapContent, ou
 
 def _require_effect(options: argparse.Namespace, chosen: Format) -> None:
     """Raise InvalidInputError for an option that the chosen format does not use."""
-    for option in ("voxel", "min_opacity", "seconds"):
+    for option in _OPTIONS:
         if getattr(options, option) is not None and option not in chosen.uses:
             formats = " or ".join(name for name, other in installed(Group.EXPORTERS) if option in other.uses)
             flag = "--" + option.replace("_", "-")

@@ -41,8 +41,8 @@ class MapContent:
 class ExportSettings:
     """What a format may use. viewer: returns what renders a map. progress: wraps the views that are rendered.
 
-    voxel_m, min_opacity, seconds: what the user sets, only for a format whose `uses` has the option's name; None means
-    the format's own value.
+    voxel_m, min_opacity, seconds, spz_version: what the user sets, only for a format whose `uses` has the option's
+    name; None means the format's own value.
     """
 
     viewer: Callable[[Gaussians], MapViewer] = view_map
@@ -50,6 +50,7 @@ class ExportSettings:
     voxel_m: float | None = None
     min_opacity: float | None = None
     seconds: float | None = None
+    spz_version: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class Format:
     max_extent_m: the largest coordinate and standard deviation that the format holds. companion: suffix of a second
     file with the same name. is_upright: its z axis points up. keeps_harmonics: it holds colours that depend on the
     view. uses: names of the options that have an effect, of
-    "voxel", "min_opacity" and "seconds".
+    "voxel", "min_opacity", "seconds" and "spz_version".
     """
 
     suffix: str

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
+from gausslite.codec.ply import left_out_note, write_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
@@ -33,9 +33,11 @@ from gausslite_export.occupancy import (
     write_nav2,
     write_octomap,
 )
-from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
+from gausslite_export.rerun_file import write_rrd
+from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, SPZ_VERSION, write_gltf, write_packed
 from gausslite_export.video import write_video
 from gausslite_render.harmonics import rotated
+from gausslite_render.splat_map import read_splats
 
 _PCD_ROW = np.dtype(
     [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
@@ -94,7 +96,7 @@ def read_map(
     report: Mapping[str, object] = MappingProxyType({}),
     max_extent_m: float = MAX_EXTENT_M,
 ) -> MapContent:
-    """Read a results folder or a PLY file.
+    """Read a results folder or a splat file.
 
     region: `roi` chooses the Gaussians of the task's region, `all` all. report: the content of the results folder's
     report.json. Gaussians with a coordinate or a standard deviation above max_extent_m are left out. Raises
@@ -102,10 +104,8 @@ def read_map(
     """
     folder, file = path if path.is_dir() else None, map_file(path)
     if not file.is_file():
-        raise MapFileError(f"{path}: expected a results folder with map.ply, or a PLY file, got neither")
-    stored = read_stored_map(file)
-    if not len(stored.gaussians):
-        raise InvalidInputError(f"{path}: expected a map with at least one Gaussian, got an empty map")
+        raise MapFileError(f"{path}: expected a results folder with map.ply, or a splat file, got neither")
+    stored = read_splats(file)
     near = _largest_extent_m(stored.gaussians) <= max_extent_m
     gaussians, harmonics = stored.gaussians.take(near), stored.harmonics[near]
     if not len(gaussians):
@@ -138,8 +138,7 @@ def read_map(
 
 def upright(content: MapContent) -> MapContent:
     """Return the map turned so that z points up, with a note, if its up is stated. Raises InvalidInputError."""
-    up = np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
-    T = upright_motion(up)
+    up, T = _up(content), upright_motion(_up(content))
     turn_rad = twist_of(T)[3:]
     angle_rad = float(np.linalg.norm(turn_rad))
     if angle_rad == 0.0:
@@ -158,6 +157,10 @@ def upright(content: MapContent) -> MapContent:
         views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
         notes=(*content.notes, note),
     )
+
+
+def _up(content: MapContent) -> Float64[ndarray, "3"]:
+    return np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
 
 
 def upright_motion(up: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
@@ -244,6 +247,16 @@ def _free(content: MapContent, settings: ExportSettings, occupancy: OccupancySet
     return free_voxels(views, render, chosen, occupied, occupancy.voxel_m)
 
 
+def _rrd(path: Path, content: MapContent, _settings: ExportSettings) -> None:
+    write_rrd(path, content, upright_motion(_up(content))[:3, :3])
+
+
+def _spz(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    version = settings.spz_version or SPZ_VERSION
+    write_packed(path, "spz", content, version)
+    print_message(f"SPZ version {version}; --spz-version writes another one")
+
+
 def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
     render = settings.viewer(content.chosen).render
     write_video(path, content.views, render, settings.seconds or VIDEO_S, settings.progress)
@@ -258,11 +271,23 @@ PLY: Final = Format(
 SPZ: Final = Format(
     ".spz",
     "compressed splats (SPZ)",
-    lambda path, map_, _: write_spz(path, map_.chosen, map_.harmonics),
+    _spz,
     max_extent_m=MAX_SPZ_COORDINATE_M,
     keeps_harmonics=True,
+    uses=("spz_version",),
 )
-SPLAT: Final = Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen))
+SOG: Final = Format(
+    ".sog", "compressed splats (SOG)", lambda path, map_, _: write_packed(path, "sog", map_), keeps_harmonics=True
+)
+COMPRESSED_PLY: Final = Format(
+    ".compressed.ply",
+    "SuperSplat's compressed PLY",
+    lambda path, map_, _: write_packed(path, "compressed.ply", map_),
+    keeps_harmonics=True,
+)
+KSPLAT: Final = Format(".ksplat", "splats of 44 bytes", lambda path, map_, _: write_packed(path, "ksplat", map_))
+SPLAT: Final = Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_packed(path, "splat", map_))
+RRD: Final = Format(".rrd", "Rerun recording of the map, its path and objects", _rrd, keeps_harmonics=True)
 GLTF: Final = Format(
     ".glb",
     "KHR_gaussian_splatting",

@@ -1,4 +1,4 @@
-"""Encode all Gaussians for splat viewers: .splat, SPZ and glTF with KHR_gaussian_splatting.
+"""Encode all Gaussians for splat viewers: packed files and glTF with KHR_gaussian_splatting.
 
 These formats have no columns for kappa, the active flag and the target; a map's own PLY file keeps them.
 """
@@ -8,23 +8,25 @@ from __future__ import annotations
 import json
 import struct
 from bisect import bisect_right
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.codec.ply import SH_C0
-from gausslite.codec.state_file import write_atomic, write_atomic_with
+from gausslite.codec.ply import SH_C0, ply_bytes
+from gausslite.codec.state_file import write_atomic
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import linear_light
 from gausslite.domain.gaussians import Gaussians
 from gausslite.process import import_extra
-from gausslite_render.harmonics import COUNTS, rotated
+from gausslite_export.format import MapContent
+from gausslite_render.harmonics import COUNTS
+from gausslite_render.viewer import by_place
 
-_SPLAT_ROW = np.dtype([("mean_m", "<f4", 3), ("scale_m", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
-_OPACITY_EDGE = 1e-6
-_TURN_ABOUT_X = np.array([1, -1, -1], np.float32)
-"""Signs of x, y, z after a turn by 180 degrees about x; also of a quaternion's x, y, z when the axes turn so."""
+SPZ_VERSION, SPZ_VERSIONS = 3, (2, 3, 4)
+_HALF = np.float32(0.5 / 255)
 MAX_SPZ_COORDINATE_M = 2047.0
 """SPZ positions are 24-bit integers with 12 fractional bits."""
 _GLB_MAGIC, _GLB_VERSION, _GLB_JSON, _GLB_BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
@@ -33,44 +35,36 @@ _Z_UP_TO_Y_UP_XYZW = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 """The rotation that a glTF node applies to a map whose z axis points up; glTF's y axis points up."""
 
 
-def write_splat(path: Path, gaussians: Gaussians) -> None:
-    """Write a .splat file: 32 bytes a Gaussian, colours and rotations in 8 bits; the most visible Gaussians first.
+def write_packed(path: Path, kind: str, content: MapContent, spz_version: int = SPZ_VERSION) -> None:
+    """Write the chosen Gaussians with the gaussforge library; kind: its name of the format.
 
-    Viewers show such files while they load; therefore the rows are sorted by opacity times volume. Raises StorageError.
+    Raises InvalidInputError without the library, StorageError.
     """
+    library = import_extra("gaussforge", "export", "packed splat files")
+    source = ply_bytes(*_as_read(kind, content.chosen, content.harmonics))
+    written = library.GaussForge().convert(source, "ply", kind, spz_version=spz_version)
+    if "data" not in written:
+        raise InvalidInputError(f"{path}: expected a map that gaussforge can write, got: {written['error']}")
+    write_atomic(path, written["data"])
+
+
+def _as_read(
+    kind: str, gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"] | None
+) -> tuple[Gaussians, str, Float32[ndarray, "n 3 k"] | None]:
+    """Return the map such that readers of the written file get it as it is, in an order that suits them."""
+    gaussians = replace(gaussians, quats_wxyz=_unit_quaternions(gaussians))
+    if kind == "compressed.ply":
+        # 256 Gaussians in the file's order share the limits between which their positions are rounded
+        order = by_place(gaussians.means_m)
+        if harmonics is not None:  # the library writes coefficient by coefficient, readers expect channel by channel
+            harmonics = harmonics[order].reshape(len(order), -1, 3).transpose(0, 2, 1)
+        return gaussians.take(order), "", harmonics
+    if kind in ("sog", "spz"):
+        return gaussians, "", harmonics
+    # viewers show these files while they load: the most visible first; the library rounds down
     order = np.argsort(-gaussians.opacities * np.prod(gaussians.scales_m, axis=1), kind="stable")
-    ordered = gaussians.take(order)
-    rows = np.zeros(len(ordered), _SPLAT_ROW)
-    rows["mean_m"], rows["scale_m"] = ordered.means_m, ordered.scales_m
-    rows["rgba"][:, :3] = _as_bytes(ordered.rgb)
-    rows["rgba"][:, 3] = _as_bytes(ordered.opacities)
-    rows["quat_wxyz"] = np.clip(np.round(_unit_quaternions(ordered) * 128 + 128), 0, 255)
-    write_atomic(path, rows.tobytes())
-
-
-def write_spz(path: Path, gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"] | None = None) -> None:
-    """Write an SPZ file with the gsply library. Raises InvalidInputError without it, StorageError.
-
-    SPZ's axes are right, up, back, and viewers take PLY's as right, down, forward; therefore y and z change sign here,
-    and viewers show both files alike.
-    """
-    gsply = import_extra("gsply", "export", "SPZ files")
-    opacity = np.clip(gaussians.opacities.astype(np.float64), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
-    data = gsply.GSData(
-        means=gaussians.means_m * _TURN_ABOUT_X,
-        scales=np.log(np.maximum(gaussians.scales_m, np.finfo(np.float32).tiny)),
-        quats=_unit_quaternions(gaussians) * np.concatenate([[np.float32(1)], _TURN_ABOUT_X]),
-        opacities=np.log(opacity / (1 - opacity)).astype(np.float32),
-        sh0=_degree_0(gaussians),
-        shN=np.zeros((len(gaussians), 0, 3), np.float32) if harmonics is None else _spz_harmonics(harmonics),
-    )
-    write_atomic_with(path, lambda partial: gsply.write_spz(str(partial), data))
-
-
-def _spz_harmonics(harmonics: Float32[ndarray, "n 3 k"]) -> Float32[ndarray, "n k 3"]:
-    """Return the coefficients in SPZ's axes and order."""
-    turned = rotated(harmonics, np.diag(_TURN_ABOUT_X).astype(np.float64))
-    return np.ascontiguousarray(turned.transpose(0, 2, 1))
+    rounded = replace(gaussians, rgb=gaussians.rgb + _HALF, opacities=gaussians.opacities + _HALF)
+    return rounded.take(order), "", None
 
 
 def write_gltf(path: Path, gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"] | None = None) -> None:
@@ -143,10 +137,6 @@ def _gltf_scene(attributes: dict[str, int]) -> dict[str, object]:
 
 def _padded(data: bytes, fill: bytes) -> bytes:
     return data + fill * (-len(data) % 4)
-
-
-def _as_bytes(values: Float32[ndarray, "n *k"]) -> ndarray:
-    return np.clip(np.round(values * 255), 0, 255).astype(np.uint8)
 
 
 def _degree_0(gaussians: Gaussians) -> Float32[ndarray, "n 3"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int8
 from numpy import ndarray
 
-from gausslite.codec.ply import gaussians_from_ply
+from gausslite.codec.ply import StoredMap, gaussians_from_ply
 from gausslite.codec.run_files import KeyframeView, read_keyframe_views
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
@@ -38,7 +38,7 @@ from gausslite_objects.areas import read_areas
 from gausslite_objects.edits import read_edits
 from gausslite_objects.mapped_objects import MappedObjects, open_memory, query, read_folder
 from gausslite_objects.object_memory import ObjectMemory
-from gausslite_render.splat_map import SplatMap, read_splats
+from gausslite_render.splat_map import read_splats
 from gausslite_render.viewer import SplatViewer
 
 _Value = TypeVar("_Value")
@@ -65,7 +65,7 @@ class FloorGrid:
 class Scene:
     """A map to look at, with the views that its keyframes saw, oldest first. Its methods are thread-safe."""
 
-    splats: SplatMap
+    splats: StoredMap
     views: Sequence[KeyframeView]
     up_axis: UpAxis
     threads: int | None = None
@@ -183,7 +183,7 @@ class ServerPlace:
                 gaussians = gaussians_from_ply(client.export(Export()))
                 if not len(gaussians):
                     raise InvalidInputError(f"{self.name}: expected a map with Gaussians, got an empty one")
-                splats = SplatMap(gaussians, np.zeros((len(gaussians), 3, 0), np.float32))
+                splats = StoredMap(gaussians, "", np.zeros((len(gaussians), 3, 0), np.float32))
                 agents = [agent.agent_id for agent in status.agents if agent.keyframes]
                 views = [view for agent_id in agents for view in _agent_views(client, agent_id)]
                 self._scene = Scene(splats, evenly(views, _MAX_VIEWS), (0.0, 0.0, 1.0), self._threads)

@@ -16,6 +16,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.cli.progress import progress_bar
+from gausslite.codec.ply import StoredMap, left_out_note
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.command_parser import bounded
 from gausslite.datasets.camera_files import read_camera_file
@@ -24,8 +25,9 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import as_text, prepare_folder, require_absent
 from gausslite.process import print_message
 from gausslite.render.rasterizer import DILATION_PX2, Rendering
+from gausslite_render.harmonics import COUNTS
 from gausslite_render.poses import FORMS, PosedView, moved, read_transform, read_views
-from gausslite_render.splat_map import SplatMap, read_splats
+from gausslite_render.splat_map import read_splats
 from gausslite_render.video_file import even_size, open_video
 from gausslite_render.viewer import SplatViewer
 
@@ -38,7 +40,7 @@ _SIDE_PX = (16, 8192)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite render`."""
     add = parser.add_argument
-    add("map", metavar="MAP", type=Path, help="a splat map of any trainer (.ply, .splat, .spz), or a run's folder")
+    add("map", metavar="MAP", type=Path, help="a splat map (PLY, .splat, .spz, .sog, .ksplat), or a run's folder")
     add("--poses", metavar="FILE", type=Path, required=True, help=FORMS)
     add("--out", metavar="DIR", type=Path, required=True, help="writes DIR/rgb/NAME.png and so on")
     add("--camera", metavar="FILE", type=Path, help="the camera: *.json, camera_info *.yaml, or COLMAP's cameras.txt")
@@ -66,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     _prepare(options, kinds)
     print_message(f"reading {options.map}")
     splats = read_splats(options.map)
-    for note in (splats.note, _lens_note(views), _summary(splats)):
+    for note in (left_out_note(splats) if splats.left_out else "", _lens_note(views), _summary(splats)):
         if note:
             print_message(note)
     writer = _Writer(options.out, kinds, options.depth_units, float(options.background == "white"))
@@ -186,18 +188,22 @@ def _lens_note(views: Sequence[tuple[PosedView, Camera]]) -> str:
     return f"{bent} of {len(views)} cameras have lens distortion: images are those of a pinhole camera" if bent else ""
 
 
-def _summary(splats: SplatMap) -> str:
-    count = f"{len(splats.gaussians):,} Gaussians with colours of degree {splats.degree}"
+def _degree(splats: StoredMap) -> int:
+    return COUNTS.index(splats.harmonics.shape[2])
+
+
+def _summary(splats: StoredMap) -> str:
+    count = f"{len(splats.gaussians):,} Gaussians with colours of degree {_degree(splats)}"
     return f"{count}; ellipses are dilated by {DILATION_PX2:g} px², as 3DGS does"
 
 
-def _report(options: argparse.Namespace, splats: SplatMap, count: int, seconds: float, writer: _Writer) -> None:
+def _report(options: argparse.Namespace, splats: StoredMap, count: int, seconds: float, writer: _Writer) -> None:
     if writer.too_far:
         limit = _MAX_DEPTH / writer.depth_units
         print_message(f"{writer.too_far} images have depth beyond {limit:g}, written as 0; use smaller --depth-units")
     rate = count / max(seconds, 1e-9)
     if options.json:
-        values = {"out": str(options.out), "images": count, "images_per_s": rate, "degree": splats.degree}
+        values = {"out": str(options.out), "images": count, "images_per_s": rate, "degree": _degree(splats)}
         print(as_text({**values, "gaussians": len(splats.gaussians)}))
     else:
         print(f"{count} images → {options.out} ({rate:.1f} images/s)")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
+from gausslite.codec.ply import StoredMap
 from gausslite.domain.camera import Camera
 from gausslite.domain.pose import inverse
 from gausslite.render.cpu import CpuRasterizer
@@ -21,7 +22,6 @@ from gausslite.render.rasterizer import (
     gaussians_to_rows,
 )
 from gausslite_render.harmonics import view_colours
-from gausslite_render.splat_map import SplatMap
 
 _BLOCK = 4096
 """Gaussians that are coloured together: their coefficients of degree 3 fit the cache of a core."""
@@ -37,17 +37,17 @@ class SplatViewer:
     threads: by default one per core that the process may use. Raises KernelError.
     """
 
-    def __init__(self, splats: SplatMap, threads: int | None = None) -> None:
+    def __init__(self, splats: StoredMap, threads: int | None = None) -> None:
         gaussians, self._coefficients = splats.gaussians, list[Float32[ndarray, "k 3 b"]]()
         if splats.harmonics.any():
-            order = _by_place(gaussians.means_m)
+            order = by_place(gaussians.means_m)
             gaussians = gaussians.take(order)
             self._coefficients = [
                 np.ascontiguousarray(splats.harmonics[order[start : start + _BLOCK]].transpose(2, 1, 0))
                 for start in range(0, len(order), _BLOCK)
             ]
         self._gaussians, self._rows = gaussians, gaussians_to_rows(gaussians)
-        if splats.degree:  # as 3DGS trains them
+        if splats.harmonics.shape[2]:  # as 3DGS trains them
             self._rows[:, RGB] = np.maximum(self._rows[:, RGB], 0)
         self._bounds = np.array([self._sphere(block) for block in range(len(self._coefficients))]).reshape(-1, 5)
         self._rasterizer = CpuRasterizer(threads)
@@ -96,7 +96,7 @@ class SplatViewer:
         return shown
 
 
-def _by_place(means_m: Float32[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
+def by_place(means_m: Float32[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
     """Return the order in which neighbours in space are close to each other: that of Morton codes."""
     low, high = np.percentile(means_m, (1, 99), axis=0)
     side_m = max(float((high - low).max()), np.finfo(np.float32).tiny)

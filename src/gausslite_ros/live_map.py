@@ -34,8 +34,9 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapContents:
-    """The Gaussians of the task's region, and a grid for each range of heights."""
+    """All Gaussians, those of the task's region, and a grid for each range of heights."""
 
+    gaussians: Gaussians
     region: Gaussians
     grids: tuple[Grid, ...]
 
@@ -71,6 +72,7 @@ class LiveMap:
             return None
         free = self._grid.indices(self._free)
         return MapContents(
+            gaussians,
             gaussians.take(gaussians.active),
             tuple(self._planar(voxels, free, replace(self._settings, height_m=range_m)) for range_m in self._heights),
         )

@@ -133,13 +133,21 @@ def _pose(position_m: Sequence[float]) -> Fields:
 
 _FLOAT32 = 7
 """Data type of sensor_msgs/PointField."""
-_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+_SPLAT_COLUMNS = {
+    "means_m": ("x", "y", "z"),
+    "scales_m": ("scale_x", "scale_y", "scale_z"),
+    "quats_wxyz": ("rot_w", "rot_x", "rot_y", "rot_z"),
+    "opacities": ("opacity",),
+}
+_POINT = np.dtype([("rgb", "<u4"), *((name, "<f4") for names in _SPLAT_COLUMNS.values() for name in names)])
 
 
 def point_cloud(gaussians: Gaussians, frame: str, stamp_ns: int) -> Fields:
-    """Return a sensor_msgs/PointCloud2 of the Gaussians' centres with their colours."""
+    """Return a sensor_msgs/PointCloud2 of coloured points, with the fields that make them splats."""
     points = np.zeros(len(gaussians), _POINT)
-    points["x"], points["y"], points["z"] = gaussians.means_m.T
+    for column, names in _SPLAT_COLUMNS.items():
+        for name, values in zip(names, np.atleast_2d(getattr(gaussians, column).T), strict=True):
+            points[name] = values
     red, green, blue = np.clip(np.round(gaussians.rgb * 255), 0, 255).astype(np.uint32).T
     points["rgb"] = red << 16 | green << 8 | blue
     size = _POINT.itemsize

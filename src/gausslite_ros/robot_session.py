@@ -181,7 +181,7 @@ def _beside(image_topic: str) -> str:
 
 
 TF, DIAGNOSTICS, OBJECTS, TASK = "/tf", "/diagnostics", "~/objects", "~/task"
-REGION, OCCUPANCY = "~/region", "~/occupancy"
+REGION, SPLATS, OCCUPANCY = "~/region", "~/splats", "~/occupancy"
 _MAX_SILENCE_S = 3.0
 _CLOSE_S = 10.0
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -227,11 +227,13 @@ class Publication:
 def publications(parameters: NodeParameters) -> dict[str, Publication]:
     """Return the topics to write. Each range of heights has a grid of its own, the first one without a number."""
     grid = Publication("nav_msgs/msg/OccupancyGrid", Delivery.LATCHED)
+    cloud = Publication("sensor_msgs/msg/PointCloud2", Delivery.LATCHED)
     return {
         TF: Publication(_TF_MESSAGE, Delivery.TRANSFORMS),
         OBJECTS: Publication("visualization_msgs/msg/MarkerArray", Delivery.TRANSFORMS),
         DIAGNOSTICS: Publication("diagnostic_msgs/msg/DiagnosticArray", Delivery.TRANSFORMS),
-        REGION: Publication("sensor_msgs/msg/PointCloud2", Delivery.LATCHED),
+        REGION: cloud,
+        SPLATS: cloud,
     } | {_grid_topic(number): grid for number in range(len(parameters.heights()))}
 
 
@@ -300,7 +302,7 @@ class RobotSession:
         return found
 
     def follow_map(self, publish: Callable[[list[Outgoing]], None], now_ns: Callable[[], int]) -> None:
-        """Publish the task's region and the occupancy grids until `close`, on a thread of its own.
+        """Publish the map, the task's region and the occupancy grids until `close`, on a thread of its own.
 
         A large map takes about a second, in which images must not wait.
         """
@@ -328,7 +330,8 @@ class RobotSession:
             Outgoing(_grid_topic(number), occupancy_grid(grid, self._parameters.cell_m, frame, stamp_ns))
             for number, grid in enumerate(contents.grids)
         ]
-        return [Outgoing(REGION, point_cloud(contents.region, frame, stamp_ns)), *grids]
+        clouds = ((REGION, contents.region), (SPLATS, contents.gaussians))
+        return [*(Outgoing(topic, point_cloud(found, frame, stamp_ns)) for topic, found in clouds), *grids]
 
     def close(self) -> str:
         """Send the waiting frames, end the mission unless end_mission is false; return its summary.

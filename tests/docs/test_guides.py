@@ -22,7 +22,7 @@ from tum_recording import write_home
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 pytest.importorskip("rosbags", reason="the bag needs the extra `ros`")
-pytest.importorskip("gsply", reason="exports need the extra `export`")
+pytest.importorskip("gaussforge", reason="exports need the extra `export`")
 
 pytestmark = pytest.mark.slow
 

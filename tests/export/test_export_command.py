@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ OPTIONS = {
 }
 
 
-FORMATS = dict(installed(Group.EXPORTERS))
+FORMATS = {name: chosen for name, chosen in installed(Group.EXPORTERS) if name != "rrd" or find_spec("rerun")}
 
 
 def run_with_map(results, folder, gaussians):
@@ -161,6 +162,7 @@ def test_the_objects_of_a_damaged_report_are_not_exported_as_none(results, tmp_p
         (("--voxel", "0.1"), "--voxel: expected with --to mesh or nav2 or octomap, got --to spz"),
         (("--min-opacity", "0.1"), "--min-opacity: expected with --to nav2 or octomap, got --to spz"),
         (("--seconds", "3"), "--seconds: expected with --to video, got --to spz"),
+        (("--to", "sog", "--spz-version", "4"), "--spz-version: expected with --to spz, got --to sog"),
     ],
 )
 def test_an_option_without_effect_is_refused(results, capsys, option, message):
@@ -176,6 +178,18 @@ def test_a_missing_run_and_a_map_far_outside_as_a_whole_are_refused(results, tmp
     run = run_with_map(results, tmp_path / "far", gaussians)
     assert main(["export", str(run), "--to", "nav2"]) == 2
     assert "expected Gaussians within 100000 m of the origin, got none" in capsys.readouterr().err
+
+
+def test_a_file_of_another_tool_is_converted_and_spz_states_its_version(results, tmp_path, capsys):
+    before = read_ply(results / "map.ply")
+    for out, options in (("a.sog", ("sog",)), ("b.spz", ("spz", "--spz-version", "4")), ("c.ply", ("ply",))):
+        source = {"a.sog": results, "b.spz": tmp_path / "a.sog", "c.ply": tmp_path / "b.spz"}[out]
+        assert main(["export", str(source), "--to", *options, "--out", str(tmp_path / out)]) == 0
+        assert ("SPZ version 4" in capsys.readouterr().err) == (out == "b.spz")
+    assert (tmp_path / "b.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
+    after = read_ply(tmp_path / "c.ply")
+    np.testing.assert_allclose(after.means_m.mean(axis=0), before.means_m.mean(axis=0), atol=1e-3)
+    np.testing.assert_allclose(after.rgb.mean(axis=0), before.rgb.mean(axis=0), atol=0.01)
 
 
 def write_points(path, content, _settings):

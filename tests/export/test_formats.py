@@ -4,9 +4,9 @@ import dataclasses
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
-import gsply
 import laspy
 import numpy as np
 import pyoctomap
@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from gausslite.codec.ply import SH_C0, read_ply, write_ply
-from gausslite.codec.run_files import read_keyframe_views
+from gausslite.codec.run_files import KeyframeView, read_keyframe_views
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of
@@ -22,22 +23,24 @@ from gausslite.plugins import Group, load
 from gausslite_export.format import ExportSettings, Format, MapContent
 from gausslite_export.formats import read_map, upright
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels
+from gausslite_render.harmonics import COUNTS
+from gausslite_render.splat_map import read_splats
 
 COUNT = 50
 
 
-def random_map(seed: int = 0) -> Gaussians:
+def random_map(seed: int = 0, count: int = COUNT) -> Gaussians:
     rng = np.random.default_rng(seed)
-    quats = rng.normal(size=(COUNT, 4)).astype(np.float32)
+    quats = rng.normal(size=(count, 4)).astype(np.float32)
     return Gaussians(
-        rng.uniform(-2, 2, (COUNT, 3)).astype(np.float32),
+        rng.uniform(-2, 2, (count, 3)).astype(np.float32),
         quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        rng.uniform(0.005, 0.05, (COUNT, 3)).astype(np.float32),
-        rng.uniform(0.4, 0.95, COUNT).astype(np.float32),
-        rng.uniform(0.05, 0.95, (COUNT, 3)).astype(np.float32),
-        rng.random(COUNT) < 0.5,
-        rng.integers(0, 1000, COUNT).astype(np.uint32),
-        rng.integers(-1, 3, COUNT).astype(np.int16),
+        rng.uniform(0.005, 0.05, (count, 3)).astype(np.float32),
+        rng.uniform(0.4, 0.95, count).astype(np.float32),
+        rng.uniform(0.05, 0.95, (count, 3)).astype(np.float32),
+        rng.random(count) < 0.5,
+        rng.integers(0, 1000, count).astype(np.uint32),
+        rng.integers(-1, 3, count).astype(np.int16),
     )
 
 
@@ -45,13 +48,13 @@ def no_rendering(gaussians):
     raise AssertionError("only meshes and videos are rendered")
 
 
-def export(tmp_path: Path, name: str, gaussians: Gaussians, region: str = "all", voxel_m: float = 0.05) -> Path:
+def export(tmp_path: Path, name: str, gaussians: Gaussians, region: str = "all", **options: Any) -> Path:
     source = tmp_path / "map.ply"
-    write_ply(source, gaussians)
+    write_ply(source, gaussians, "", options.pop("harmonics", None))
     chosen: Format = load(Group.EXPORTERS, name)
     out = tmp_path / f"out{chosen.suffix}"
     content = read_map(source, region, max_extent_m=chosen.max_extent_m)
-    chosen.write(out, content, ExportSettings(no_rendering, voxel_m=voxel_m))
+    chosen.write(out, content, ExportSettings(no_rendering, **{"voxel_m": 0.05, **options}))
     return out
 
 
@@ -63,18 +66,27 @@ def test_ply_of_the_region_holds_exactly_its_gaussians(tmp_path):
     assert (written.kappa == gaussians.kappa[gaussians.active]).all()
 
 
-@pytest.mark.slow
-def test_spz_is_read_by_gsply_within_its_resolution(tmp_path):
-    gaussians = random_map()
-    data = gsply.read_spz(str(export(tmp_path, "spz", gaussians)))
-    # SPZ's y axis points up and its z axis back
-    np.testing.assert_allclose(data.means * [1, -1, -1], gaussians.means_m, atol=1e-3)
-    np.testing.assert_allclose(np.exp(data.scales), gaussians.scales_m, rtol=0.07)
-    np.testing.assert_allclose(1 / (1 + np.exp(-data.opacities.ravel())), gaussians.opacities, atol=0.01)
-    np.testing.assert_allclose(data.sh0 * SH_C0 + 0.5, gaussians.rgb, atol=0.02)
-    quats = data.quats / np.linalg.norm(data.quats, axis=1, keepdims=True) * [1, 1, -1, -1]
-    alignment = np.abs((quats * gaussians.quats_wxyz).sum(axis=1))
-    assert alignment.min() > 0.999
+PACKED = [("compressed-ply", None), ("ksplat", None), ("sog", None), ("splat", None), *(("spz", n) for n in (2, 3, 4))]
+"""Formats that the library writes, with the version of SPZ."""
+SPLATS = ("centers", "scales", "quaternions", "colors", "sh_coefficients")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize(("name", "version"), PACKED)
+def test_a_packed_file_is_read_within_its_resolution_in_the_map_s_own_axes(tmp_path, name, version, degree):
+    rng, sent = np.random.default_rng(degree), random_map(count=300)
+    harmonics = rng.uniform(-0.9, 0.9, (300, 3, COUNTS[degree])).astype(np.float32)
+    read = read_splats(export(tmp_path, name, sent, harmonics=harmonics, spz_version=version))
+    distances_m = np.linalg.norm(read.gaussians.means_m[None] - sent.means_m[:, None], axis=2)
+    order, got = distances_m.argmin(axis=1), read.gaussians
+    assert sorted(order) == list(range(300))
+    np.testing.assert_allclose(got.means_m[order], sent.means_m, atol=2.5e-3)
+    np.testing.assert_allclose(got.scales_m[order], sent.scales_m, rtol=0.04)
+    np.testing.assert_allclose(got.opacities[order], sent.opacities, atol=0.003)
+    np.testing.assert_allclose(got.rgb[order], sent.rgb, atol=0.005)
+    assert np.abs((got.quats_wxyz[order] * sent.quats_wxyz).sum(axis=1)).min() > 0.993
+    kept = harmonics if name not in ("splat", "ksplat") else harmonics[:, :, :0]
+    np.testing.assert_allclose(read.harmonics[order], kept, atol=0.09)
 
 
 def test_splat_rows_hold_32_bytes_most_visible_first(tmp_path):
@@ -229,9 +241,34 @@ def test_too_many_samples_of_large_gaussians_are_refused(tmp_path):
 def test_spz_leaves_out_what_its_integers_cannot_hold(tmp_path):
     gaussians = random_map()
     gaussians.means_m[7, 1] = -2100
-    data = gsply.read_spz(str(export(tmp_path, "spz", gaussians)))
-    assert len(data.means) == COUNT - 1
-    np.testing.assert_allclose(data.means * [1, -1, -1], np.delete(gaussians.means_m, 7, axis=0), atol=1e-3)
+    read = read_splats(export(tmp_path, "spz", gaussians)).gaussians
+    np.testing.assert_allclose(read.means_m, np.delete(gaussians.means_m, 7, axis=0), atol=1e-3)
+
+
+def test_a_recording_of_rerun_has_splats_keyframes_and_boxes_at_their_times(tmp_path):
+    chunk = pytest.importorskip("rerun.chunk", reason="needs the extra `rerun`")
+    gaussians, camera = random_map(), Camera.centred(60.0, 64, 48)
+    views = [KeyframeView(i, i * 10**9, camera, np.eye(4), 0) for i in (0, 1)]
+    places = {"centroid_m": [1, 2, 3], "min_m": [0, 1, 2], "max_m": [2, 3, 4]}
+    mug = {"id": "mug-1", "noun": "mug", "role": "target", "confidence": 0.9, "first_seen_ns": 5, "last_seen_ns": 6}
+    report = {"up": [0.0, -1.0, 0.0], "objects": [mug | places]}
+    harmonics = np.random.default_rng(0).uniform(-1, 1, (COUNT, 3, 8)).astype(np.float32)
+    content = MapContent(gaussians, gaussians, views=views, report=report, harmonics=harmonics)
+    load(Group.EXPORTERS, "rrd").write(tmp_path / "map.rrd", content, ExportSettings(no_rendering))
+    batches = {str(c.entity_path): c.to_record_batch() for c in chunk.RrdReader(tmp_path / "map.rrd").stream()}
+    splats = {name: np.array(batches["/map/gaussians"][f"GaussianSplats3D:{name}"].to_pylist()[0]) for name in SPLATS}
+    np.testing.assert_allclose(splats["centers"], gaussians.means_m)
+    np.testing.assert_allclose(splats["scales"], gaussians.scales_m)
+    np.testing.assert_allclose(splats["quaternions"], gaussians.quats_wxyz[:, [1, 2, 3, 0]])
+    np.testing.assert_allclose(splats["colors"] >> 24, gaussians.rgb[:, 0] * 255, atol=0.51)
+    np.testing.assert_allclose(splats["colors"] & 255, gaussians.opacities * 255, atol=0.51)
+    coefficients = splats["sh_coefficients"].reshape(COUNT, 15, 3)
+    padded = np.pad(harmonics, ((0, 0), (0, 0), (0, 7)))
+    np.testing.assert_allclose(coefficients, padded.transpose(0, 2, 1), atol=1e-3)  # half floats
+    assert batches["/map/keyframe"].num_rows == 2
+    assert [time.value for time in batches["/map/objects/mug-1"]["capture_time"]] == [5]
+    R_upright_map = np.reshape(batches["/map"]["Transform3D:mat3x3"].to_pylist()[0], (3, 3)).T
+    np.testing.assert_allclose(R_upright_map @ [0, -1, 0], [0, 0, 1], atol=1e-6)
 
 
 def test_octomap_marks_the_surface_and_nothing_else(tmp_path):

@@ -15,7 +15,7 @@ from gausslite_ros.live_frames import LiveCounters
 from gausslite_ros.live_map import Grid
 from gausslite_ros.messages import CompressedImageMessage, stamp_ns
 from gausslite_ros.outgoing import correction_transform, diagnostics, object_markers, occupancy_grid, point_cloud
-from gausslite_ros.robot_session import DIAGNOSTICS, OBJECTS, OCCUPANCY, REGION, TF
+from gausslite_ros.robot_session import DIAGNOSTICS, OBJECTS, OCCUPANCY, REGION, SPLATS, TF
 
 pytest.importorskip("rospy", reason="the node of ROS 1 needs rospy")
 node: Any = pytest.importorskip("gausslite_ros.node_ros1")
@@ -24,6 +24,7 @@ FIELDS = {
     TF: correction_transform(np.eye(4), ("map", "odom"), NOW_NS),
     OBJECTS: object_markers((MUG,), "map", NOW_NS),
     REGION: point_cloud(plain_gaussians([[1.0, 2.0, 3.0]]), "map", NOW_NS),
+    SPLATS: point_cloud(plain_gaussians([[1.0, 2.0, 3.0]]), "map", NOW_NS),
     OCCUPANCY: occupancy_grid(Grid(np.array([[-1, 0, 100]], np.int8), (0.5, 1.5)), 0.05, "map", NOW_NS),
     DIAGNOSTICS: diagnostics(SNAPSHOT, (LiveCounters(), SentFrames()), ("a problem",), NOW_NS, "agent"),
 }

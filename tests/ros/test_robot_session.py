@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from agent_running import TASK, Agent, agent
 from robot_bag import COLOUR, COLOUR_INFO, DELAYS_NS, DEPTH, DEPTH_INFO, arrivals, write_robot_bag
+from sample_gaussians import random_gaussians
 from waiting import wait_until
 
 from gausslite.domain.errors import InvalidInputError
@@ -23,12 +24,13 @@ from gausslite_link.agent_link import AgentLink, AgentSnapshot, SentFrames
 from gausslite_ros.bag_file import BagAddress
 from gausslite_ros.bag_source import BagSource
 from gausslite_ros.live_frames import LiveCounters
-from gausslite_ros.outgoing import ERROR, OK, WARN, correction_transform, diagnostics, object_markers
+from gausslite_ros.outgoing import ERROR, OK, WARN, correction_transform, diagnostics, object_markers, point_cloud
 from gausslite_ros.robot_session import (
     DIAGNOSTICS,
     OBJECTS,
     OCCUPANCY,
     REGION,
+    SPLATS,
     TF,
     NodeParameters,
     Outgoing,
@@ -131,7 +133,9 @@ def test_a_replayed_bag_is_mapped_as_the_bag_source_gives_it(tmp_path: Path, del
         last = next(filter(None, maps))
         cells = np.array(published(last, OCCUPANCY).data)
         assert {0, 100} <= set(cells.tolist()) <= {-1, 0, 100}
-        assert published(last, REGION).header.frame_id == "map"
+        region, splats = published(last, REGION), published(last, SPLATS)
+        assert region.header.frame_id == splats.header.frame_id == "map"
+        assert region.width <= splats.width == len(link.map().batch.gaussians)
         assert "5 frames" in session.close()
         assert running.client.status().frames_mapped == len(source)
 
@@ -221,6 +225,19 @@ def test_objects_become_a_box_and_a_text_in_the_maps_frame() -> None:
     np.testing.assert_allclose([box.scale.x, box.scale.y, box.scale.z], 0.2)
     assert (text.type, text.text, text.id) == (9, "mug 0.80", 1)
     assert text.pose.position.z > 0.6
+
+
+def test_a_cloud_has_the_columns_of_splats() -> None:
+    sent = random_gaussians(5)
+    cloud = point_cloud(sent, "map", NOW_NS)
+    names = [field["name"] for field in cloud["fields"]]
+    assert [field["offset"] for field in cloud["fields"]] == [4 * place for place in range(len(names))]
+    rows = np.frombuffer(cloud["data"], np.dtype([(name, "<f4") for name in names]))
+    columns = {"means_m": "x y z", "scales_m": "scale_x scale_y scale_z", "quats_wxyz": "rot_w rot_x rot_y rot_z"}
+    for column, fields in columns.items():
+        np.testing.assert_array_equal(np.stack([rows[name] for name in fields.split()], axis=1), getattr(sent, column))
+    np.testing.assert_array_equal(rows["opacity"], sent.opacities)
+    np.testing.assert_allclose((rows["rgb"].view("<u4") >> 8 & 255) / 255, np.clip(sent.rgb[:, 1], 0, 1), atol=0.003)
 
 
 def test_each_range_of_heights_has_a_grid() -> None:

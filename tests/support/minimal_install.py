@@ -95,6 +95,7 @@ def missing_extras(out: Path) -> list[dict[str, object]]:
         ("metrics", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--metrics", "127.0.0.1:0")),
         ("mcp", "gausslite", ("mcp", run_folder)),
         *(("export", "gausslite", ("export", run_folder, "--to", kind)) for kind in ("spz", "las", "octomap", "mesh")),
+        ("rerun", "gausslite", ("export", run_folder, "--to", "rrd")),
         ("cuda", "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / "cuda"), "--set", "rasterizer=cuda")),
     ]
     return [{"extra": extra, **run(program, arguments)} for extra, program, arguments in cases]

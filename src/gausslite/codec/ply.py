@@ -217,7 +217,7 @@ def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
     before, vertex = elements[: names.index("vertex")], elements[names.index("vertex")]
     missing = [name for name in _STANDARD if name not in vertex.fields]
     if "packed_position" in vertex.fields:
-        raise MapFileError("expected an uncompressed 3DGS map, got SuperSplat's compressed PLY; save it uncompressed")
+        raise MapFileError("expected a 3DGS map, got a compressed PLY; `gausslite export --to ply` unpacks it")
     if missing:
         raise MapFileError(f"expected the columns of a 3DGS map, missing {', '.join(missing)}")
     present = [name for name in (*_STANDARD, *_EXTRAS) if name in vertex.fields]
