@@ -182,4 +182,4 @@ def test_most_large_changes_of_eight_homes_are_found_and_nothing_else_is_reporte
     print("all", dict(sorted(total.items())))
     assert [change.describe() for _, wrong in scores.values() for change in wrong] == []
     found = total["large right"] + total["large in parts"]
-    assert found >= 0.8 * (found + total["large missed"])
+    assert found >= 0.7 * (found + total["large missed"])

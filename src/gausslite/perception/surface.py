@@ -280,7 +280,7 @@ def is_off_planes(
 def _planes(points_m: Float64[ndarray, "n 3"], limits_m: _Limits) -> list[Float64[ndarray, "4"]]:
     """Return unit normals and offsets of some planes, the largest first; each from random triples of points."""
     step = max(1, len(points_m) // _MAX_PLANE_POINTS)
-    points_m, limits_m = points_m[::step], np.broadcast_to(limits_m, len(points_m))[::step]
+    points_m, near_m = points_m[::step], np.broadcast_to(limits_m, len(points_m))[::step]
     min_points = max(_MIN_PLANE_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
     rng = np.random.default_rng(0)
     planes: list[Float64[ndarray, "4"]] = []
@@ -290,12 +290,12 @@ def _planes(points_m: Float64[ndarray, "n 3"], limits_m: _Limits) -> list[Float6
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
         offsets_m = np.einsum("ij,ij->i", normals, corners[:, 0])
-        is_near = (np.abs(points_m @ normals.T - offsets_m) < limits_m[:, None]) & (lengths[:, 0] > 0)
+        is_near = (np.abs(points_m @ normals.T - offsets_m) < near_m[:, None]) & (lengths[:, 0] > 0)
         best = int(is_near.sum(axis=0).argmax())
         if np.count_nonzero(is_near[:, best]) < min_points:
             break
         planes.append(np.append(normals[best], offsets_m[best]))
-        points_m, limits_m = points_m[~is_near[:, best]], limits_m[~is_near[:, best]]
+        points_m, near_m = points_m[~is_near[:, best]], near_m[~is_near[:, best]]
     return planes
 
 
