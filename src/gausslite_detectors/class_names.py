@@ -95,7 +95,7 @@ def _parsed(text: str) -> Any:
     words = text.splitlines() if "\n" in text else text.replace(";", ",").split(",")
     words = [word.strip() for word in words if word.strip()]
     indexed = [_INDEXED.fullmatch(word) for word in words]
-    return dict(entry.groups() for entry in indexed if entry) if all(indexed) else words
+    return {entry[1]: entry[2] for entry in indexed if entry} if all(indexed) else words
 
 
 def _names_in(value: Any) -> dict[int, str]:

@@ -111,7 +111,7 @@ def help_texts() -> str:
 def test_flags_named_in_pages_exist(help_texts: str) -> None:
     known_flags = set(re.findall(r"--[a-z][\w-]*", help_texts))
     # of pip, docker and our own scripts
-    others = {"--check", "--editable", "--no-index", "--build", "--python"}
+    others = {"--check", "--editable", "--no-index", "--no-deps", "--build", "--python"}
     others |= {"--homes", "--gains", "--pose-noise"}
     # of venv and rosbag
     others |= {"--system-site-packages", "--clock"}

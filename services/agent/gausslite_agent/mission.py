@@ -103,7 +103,7 @@ class AgentMission:
 
         can_find: False if any task would fail. source_notes: messages on the recording.
         """
-        self.can_find, self._source_notes = can_find, source_notes
+        self.can_find, self._source_notes, self._save_failure = can_find, source_notes, ""
         self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
         self._up_axis = settings.up_axis or (0.0, 0.0, 1.0)
         self._state_machine = MissionStateMachine()
@@ -129,8 +129,9 @@ class AgentMission:
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator about the mission itself."""
         failure = self._state_machine.failure
-        failed = (f"the mission failed: {failure}",) if failure else ()
-        return (*failed, *self._source_notes, *(() if self.can_find else (NO_DETECTOR,)))
+        failed = f"the mission failed: {failure}" if failure else ""
+        blind = "" if self.can_find else NO_DETECTOR
+        return tuple(filter(None, (failed, self._save_failure, *self._source_notes, blind)))
 
     @property
     def end_by_options(self) -> EndRequest:
@@ -248,8 +249,15 @@ class AgentMission:
         return self._worker.save(settings.state, config, settings.task or "").result()
 
     def save_if_mapping(self) -> float:
-        """Do the same, unless the mission is not mapping now."""
-        return self.save() if self.state is MissionState.MAPPING else 0.0
+        """Do the same, unless the mission is not mapping now; a failure is noted until a save succeeds."""
+        try:
+            took_s, failure = self.save() if self.state is MissionState.MAPPING else 0.0, ""
+        except GaussLiteError as error:
+            took_s, failure = 0.0, f"the mission is not saved: {error}"
+            if not self._save_failure:
+                _log.warning("%s", failure)
+        self._save_failure = failure
+        return took_s
 
     def _require_later(self, time_ns: int) -> None:
         latest_ns = self._latest_ns

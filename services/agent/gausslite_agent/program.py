@@ -15,7 +15,7 @@ from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import NONE
 from gausslite.datasets.calibration import as_recorded_notes, open_calibrator
 from gausslite.datasets.source import Source
-from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.build import EstimatorFactory
@@ -116,16 +116,9 @@ class PeriodicSave:
         self._ended.set()
 
     def _run(self) -> None:
-        wait_s, failed = self._interval_s, False
+        wait_s = self._interval_s
         while not self._ended.wait(wait_s):
-            wait_s = self._interval_s
-            try:
-                wait_s = max(wait_s, _MIN_INTERVAL_PER_SAVE * self._save())
-                failed = False
-            except GaussLiteError as error:
-                if not failed:
-                    _log.warning("the mission is not saved: %s", error)
-                failed = True
+            wait_s = max(self._interval_s, _MIN_INTERVAL_PER_SAVE * self._save())
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -188,7 +181,6 @@ async def _serve(settings: AgentSettings) -> int:
         lost = mission.describe_lost_data()
         if lost:
             _log.error("%s", lost)
-        if lost:
             return 1
         return ROBOT_LOST if worker.status().localisation is LocalisationState.LOST else 0
 

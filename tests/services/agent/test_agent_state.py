@@ -318,3 +318,19 @@ def test_a_real_agent_resumes_its_mission(fusion: RunningServer, tmp_path: Path)
     assert SavedMission.read(tmp_path / "a.state", *fixed_settings).checkpoint == MissionCheckpoint(
         5, RuleParser().parse("Pick up the cup"), "Pick up the cup", revisions[-1]
     )
+
+
+def test_a_save_that_fails_is_a_note_of_the_status_until_one_succeeds(tmp_path: Path) -> None:
+    folder = tmp_path / "card"
+    folder.mkdir()
+    with agent_run(settings(folder / "robot.state")) as (mission, _):
+        folder.rmdir()
+        folder.write_text("a card that was taken out")
+        assert mission.save_if_mapping() == 0.0
+        (note,) = mission.notes
+        assert note.startswith("the mission is not saved: ")
+        assert "robot.state" in note
+        folder.unlink()
+        folder.mkdir()
+        assert mission.save_if_mapping() > 0.0
+        assert mission.notes == ()
