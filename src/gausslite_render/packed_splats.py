@@ -69,7 +69,8 @@ class Splats:
         means_m, quats, scales_m, opacities, rgb = (np.ascontiguousarray(values, np.float32) for values in columns)
         n, positive_m = len(means_m), np.maximum(scales_m, np.finfo(np.float32).tiny)
         kappa, target = np.zeros(n, np.uint32), np.full(n, NO_TARGET, np.int16)
-        return Gaussians(means_m, quats, positive_m, opacities, rgb, np.zeros(n, np.bool_), kappa, target)
+        active = np.zeros(n, np.bool_)
+        return Gaussians(means_m, quats, positive_m, opacities, rgb, active=active, kappa=kappa, target=target)
 
 
 def require(condition: bool, expected: str, got: object) -> None:

@@ -325,7 +325,9 @@ def snapped_to_edges(mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -
 
 
 def _guided_filter(
-    guide: Float32[ndarray, "h w 3"], values: Float32[ndarray, "h w"], wanted: Bool[ndarray, "h w"]
+    guide: Float32[ndarray, "h w 3"],
+    values: Float32[ndarray, "h w"],
+    wanted: Bool[ndarray, "h w"],
 ) -> Float32[ndarray, "h w"]:
     """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels."""
     window = _EDGE_WINDOW

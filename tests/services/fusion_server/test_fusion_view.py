@@ -225,7 +225,7 @@ def coloured_frame(index: int, grey: int) -> Frame:
 
 def test_a_refused_refinement_is_reported_on_the_page(fusion: RunningServer):
     page = SeenPage()
-    panel = FusionPanel(page, FusionClient(fusion.client.address))
+    panel = FusionPanel(page, FusionClient(fusion.client.address), ServerMemory(fusion.client.address))
     try:
         panel.refine()
         assert "refinement: expected a fused map and keyframes, got 0 Gaussians" in text(page)
