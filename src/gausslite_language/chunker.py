@@ -146,8 +146,6 @@ class VerbChunker:
             self._require(verbs.verb_base(word) or word)
         elif verbs.base_of_ed(word) in _PLACING and self._asks_for_state():
             buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
-        elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
-            pass  # "the coffee went cold"
         elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN and before is not Tag.AUXILIARY:
             if verbs.base_of_ed(word) in _NAMING:
                 buffer.emit_preposition("purpose")  # "the drum labelled acid"

@@ -43,6 +43,7 @@ def lost_nouns(tagged: Sequence[tuple[str, Tag]], draft: GraphDraft) -> tuple[st
         before, next_tag = padded[index + 1][1], padded[index + 3][1]
         is_definite = word in _DEFINITE or (is_definite and tag in _CLOSERS and before is not Tag.NOUN)
         acts = clause is ClauseType.STATEMENT and next_tag in (_PREDICATES if index else _AFTER_CALLED)
+        acts = acts and not (next_tag is Tag.AUXILIARY and padded[index + 4][1] is Tag.PREPOSITION)
         closes = next_tag is not Tag.NOUN if tag is Tag.NOUN else is_definite and next_tag not in _CLOSERS
         unknown = word.isalpha() and not is_english(word) and not is_in_dictionary(word)
         acts = acts or clause is ClauseType.REASON or before in _BEFORE_STATES
@@ -69,5 +70,7 @@ def unknown_names(draft: GraphDraft) -> tuple[str, ...]:
     phrases = (*draft.targets, *draft.anchors, *draft.excluded)
     nouns = (noun_phrase(phrase.split(), False) for phrase in phrases)
     return tuple(
-        noun.text for noun in nouns if not noun.is_known and (is_english(noun.head) or not is_in_dictionary(noun.head))
+        noun.text
+        for noun in nouns
+        if not noun.is_known and (is_english(noun.head) or not is_in_dictionary(noun.head) or noun.head[-3:] == "ing")
     )

@@ -263,10 +263,6 @@ class GraphBuilder:
         if pending == "of" and not self._clause.skip_of_phrase and is_picture:
             self._draft.warnings.append(f"what {self._described!r} shows is not understood: {noun.text!r} is dropped")
             return
-        longer = [phrase for phrase in self._draft.targets if phrase.endswith(f" {noun.text}")]
-        repeats = noun.is_definite and noun.has_determiner and noun.text not in self._draft.mentions
-        if pending is None and repeats and len(longer) == 1:
-            noun = phrase_from_text(longer[0])  # "take the alarm clock and look at the clock"
         if self._partitive is not None and pending in (None, "of"):
             (superlative, pending, conjoined), self._partitive = self._partitive, None
             noun = NounPhrase((*superlative.words, *noun.words), True)

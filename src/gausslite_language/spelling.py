@@ -19,7 +19,7 @@ _SHORT_FORMS: Final[dict[str, str]] = TABLES["abbreviations"]
 _SHORT_FORM: Final = re.compile(rf"(?<![\w/'-])(?:{'|'.join(map(re.escape, _SHORT_FORMS))})(?![\w/'-])")
 _CONTRACTIONS: Final = frozenset(word for word in _SHORT_FORMS if len(word) > 4 and word.isalpha())
 _NAME: Final = re.compile(r"(?<=[\w,] )[A-Z]\w+")
-_WORD: Final = re.compile(r"(?<![\w'])[^\W\d_]{3,}(?![\w'])")
+_WORD: Final = re.compile(r"(?<![\w'-])[^\W\d_]{3,}(?![\w'-])")
 # "an aple", "the flor and": words after an article, at the end of the phrase
 _LAST: Final = re.compile(rf"\b(?:an?|the|my) (\w+)(?=$|[,.;!?]| (?:{'|'.join(sorted(PREPOSITIONS))}|and|or|is|are)\b)")
 _COMMON: Final = NOUNS | VERBS

@@ -125,6 +125,7 @@ _BE: Final = word_set("is are was were")
 _OBJECTS_OF_VERBS: Final = word_set("the a an my it them up")
 _BEFORE_NAMES: Final = _ARTICLES | word_set("to at in near from")
 _FINITE: Final = word_set("is are was were has have can will")
+_AFTER_NAMES: Final = (_FINITE | PREPOSITIONS.keys() | {"", ",", "."}) - {"to"}
 _BEFORE_OBJECTS: Final = lexicon.DETERMINERS | {"no"}
 _DEMONSTRATIVES: Final = word_set("this these those")
 _AROUND: Final = word_set("around under behind along between beneath")
@@ -249,6 +250,7 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (opens and is_open and after in _BELONG and singular(word) != word)  # "drinks go on the shelf"
         or (before in _DEMONSTRATIVES and word in verbs.VERBS and after in PREPOSITIONS and not _describes(word))
         or (word.endswith("ing") and named)
+        or (word == "can" and after not in verbs.VERBS and (after in _AFTER_NAMES or _describes(after)))
         or (word == "half" and after == "of"),  # "stand lamp"
         Tag.PREPOSITION: word == "outside" and after in lexicon.DETERMINERS,
         Tag.GERUND: verbs.base_of_ing(word) is not None and (before in ("without", *_BE) or before in denying),
@@ -283,7 +285,8 @@ def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Op
     is_noun = _is_noun(word)
     options = _verb_options(before, word, is_noun)
     follows_singular = _is_noun(before) and singular(before) == before
-    if Tag.VERB in options and not is_noun and follows_singular and after in _OBJECTS_OF_VERBS:
+    has_object = after in _OBJECTS_OF_VERBS or (_is_noun(after) and word in verbs.words("never_nouns"))
+    if Tag.VERB in options and not is_noun and follows_singular and has_object:
         options[Tag.VERB] = -10  # no subject of this form: "the table pick up the cup"
     if _describes(word):
         options[Tag.ADJECTIVE] = 0

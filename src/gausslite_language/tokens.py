@@ -220,7 +220,6 @@ _PLAIN: Final = {
     r"i(?: am)? (?:looking|searching)(?: for)?": "find",
     r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
     rf"{_LIMIT} (?:once|twice)|(?:{_LIMIT} )?{_VALUE} times|{_LIMIT}(?= {_VALUE} (?!{_UNIT}\b))": "",
-    r"[.,;] (?:location|position|place)(?: is)?:": "",
     r"after (?:that|this)(?= \w)": "then",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
         "handle"
@@ -235,7 +234,6 @@ _PLAIN: Final = {
     r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"(?<!^)(?<!^ok )so(?: that)?(?= (?:i|you|we|s?he|they|it|the|my|our|no(?:body)?|people|every\w+)\b)": "because",
-    # light verbs, whose noun carries the meaning
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
@@ -246,6 +244,8 @@ _PLAIN: Final = {
     r"make sure (?:not to|you don't|to not)|there is no need (?:for you )?to|try not to|avoid to": "do not",
     r"^(\w+) nothing": r"do not \1 anything",
     r"(?:keep (?:your|the) )?(?:hands|fingers) (?:off|away from)": "do not touch",
+    r"prevent (.{2,40}?) to(?= \w)": r"find \1, do not",
+    r"in the middle of (?=(?:the|an?) [\w ]{2,30} and (?:the|an?) )": "between ",
     r"(?:keep|stop|prevent) (.{2,40}?) (?:from(?= \w+ing\b)|off(?= (?:the|my|an?)\b))": r"find \1, do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
