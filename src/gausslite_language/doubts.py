@@ -51,7 +51,7 @@ def lost_nouns(tagged: Sequence[tuple[str, Tag]], draft: GraphDraft) -> tuple[st
             continue
         known = used if is_definite else used | _NO_OBJECTS_BARE
         known = known | lexicon.DEFECTS if ("for", Tag.PREPOSITION) in tagged[:index] else known
-        if not ({word, singular(word)} & known or _is_amount(tagged, index, known)):
+        if not ({word, singular(word)} & known or _is_amount(tagged, index, used)):
             lost[singular(word)] = None
     return tuple(lost)
 
