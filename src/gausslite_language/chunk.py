@@ -173,7 +173,8 @@ _PICTURING_VERBS = word_set("take make get capture shoot draw snap record want n
 
 def names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:
     """Return False for names of the robot, and for places, routes and amounts that stand for another noun."""
-    is_named = (noun.has_determiner and pending == "to") or (noun.is_plural and pending == "with")
+    is_named = pending == "to" or verb in verbs.AVOIDING_VERBS
+    is_named = (noun.has_determiner and is_named) or (noun.is_plural and pending == "with")
     if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES and not is_named:
         return False
     if noun.head in lexicon.TASK_NOUNS and pending is None:
@@ -204,13 +205,6 @@ def _names_by_kind(noun: NounPhrase, pending: str | None, verb: str | None, of_f
         if pending == "to" and lexicon.is_space(noun.words):
             return True  # "to the cold room"
         return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
-    if (
-        verb in verbs.SPEAKING_VERBS | {"report"}
-        and pending is None
-        and (verb == "say" or of_follows)
-        and noun.head not in lexicon.PEOPLE | lexicon.CONTAINERS
-    ):
-        return False  # "say your name", "tell me the name of the person"
     if noun.words == ("light",) and of_follows and pending is not None:
         return False  # "by the light of the lamp"
     if noun.head in lexicon.ROUTES and not compound and noun.words[0] not in lexicon.COLOURS:

@@ -10,6 +10,7 @@ from gausslite_language.chunk import Chunk, ChunkBuffer, ChunkKind
 from gausslite_language.clause_types import (
     SUBJECT_PRONOUNS,
     SUBJECT_TAGS,
+    UNKNOWN_PEOPLE,
     WISHES,
     ClauseType,
     clause_types,
@@ -34,6 +35,7 @@ _OBJECT_PHRASE_TAGS: Final = OBJECT_START_TAGS | {Tag.ANAPHOR}
 _DO_FORMS: Final = word_set("do does did")
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
+_ACTING: Final = verbs.HOLDING_VERBS | verbs.GO_VERBS | _PASSING
 _BELONGING_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE})
 
 
@@ -90,9 +92,6 @@ class VerbChunker:
                 self._require(base)
         elif belongs and not is_command(tagged, index):
             buffer.emit(ChunkKind.SUBJECT_VERB, base)
-        elif word == "wants" and subject is Tag.NOUN and buffer.tag(1) in OBJECT_START_TAGS:
-            buffer.chunks.pop()  # "my sister wants the soda"
-            buffer.emit(ChunkKind.VERB, base)
         elif subject not in SUBJECT_TAGS or is_wish or is_command(tagged, index):
             buffer.emit(ChunkKind.VERB, base)
         elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.INDEFINITE) and buffer.tag(1) in _OBJECT_TAGS:
@@ -130,7 +129,7 @@ class VerbChunker:
     def _is_compound(self, base: str | None) -> bool:
         """Return True if a countable noun follows without a determiner, and the noun before is no animate being."""
         noun, after = singular(self._buffer.words[-1]), self._buffer.word(1)
-        acts = base in verbs.HOLDING_VERBS | _PASSING or noun in lexicon.PEOPLE or is_kind_of(noun, "animal")
+        acts = base in _ACTING or noun in lexicon.PEOPLE or is_kind_of(noun, "animal")
         is_mass = singular(after) != after or is_kind_of(after, "liquid") or is_kind_of(after, "material")
         return self._buffer.tag(1) is Tag.NOUN and not (is_mass or acts or is_kind_of(noun, "person"))
 
@@ -147,8 +146,6 @@ class VerbChunker:
             self._require(verbs.verb_base(word) or word)
         elif verbs.base_of_ed(word) in _PLACING and self._asks_for_state():
             buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
-        elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
-            pass  # "the coffee went cold"
         elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN and before is not Tag.AUXILIARY:
             if verbs.base_of_ed(word) in _NAMING:
                 buffer.emit_preposition("purpose")  # "the drum labelled acid"
@@ -299,11 +296,6 @@ class _Chunker:
 
     def _noun(self, word: str) -> None:
         buffer = self._buffer
-        if buffer.tag(-1) is Tag.NEGATION and buffer.last_kind() is ChunkKind.NOT_UNDERSTOOD:
-            return  # "that is not rotten"
-        follows_state = buffer.tag(-1) is Tag.CONJUNCTION and buffer.last_kind(1) is ChunkKind.ATTRIBUTE
-        if follows_state and not buffer.words and buffer.tag(1) not in NOUN_PHRASE_TAGS:
-            return  # "it is white and oval"
         buffer.words.append(word)
 
     def _adjective(self, word: str) -> None:
@@ -357,6 +349,8 @@ class _Chunker:
         buffer = self._buffer
         buffer.close()
         buffer.determiner_at = buffer.index
+        if self._is_statement and word in UNKNOWN_PEOPLE and buffer.tag(1) in (Tag.VERB, Tag.PARTICIPLE):
+            return  # "someone knocked over the plant"
         asked = [buffer.tag(offset) for offset in (2, 3, 4)]
         if word == "what" and asked == [Tag.PRONOUN, Tag.VERB, Tag.PREPOSITION]:
             buffer.emit(ChunkKind.VERB, "find")  # "what did I put in the drawer"
@@ -420,8 +414,8 @@ class _Chunker:
         before, after = buffer.tag(-1), buffer.tag(1)
         if word == "of" and before is Tag.DETERMINER and not buffer.words:
             return
-        if not buffer.words and buffer.chunks and buffer.chunks[-1].word == "via":
-            return  # "around the left side of the table"
+        if before is Tag.PARTICIPLE and not buffer.words and buffer.last_kind() is ChunkKind.STATEMENT:
+            return  # "someone knocked over"
         directly = not buffer.words and buffer.last_kind() is ChunkKind.VERB and before is Tag.VERB
         elided = [chunk.kind for chunk in buffer.chunks[-3:-1]] == [ChunkKind.NOUN, ChunkKind.CONJUNCTION]
         # "rinse the plate and put in the rack"

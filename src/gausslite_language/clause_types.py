@@ -20,7 +20,7 @@ SUBJECT_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.PRONOUN, Tag.RELA
 # after a subject they state what someone cannot do: "my son can't find his bear"
 INABILITIES: Final = word_set("can't cannot doesn't")
 _LOST_STATES: Final = word_set("missing lost gone")
-_UNKNOWN_PEOPLE: Final = word_set("somebody someone nobody everybody everyone")
+UNKNOWN_PEOPLE: Final = word_set("somebody someone nobody everybody everyone")
 _OTHER_PEOPLE: Final = word_set("i he she they")
 _REASONS: Final = word_set("because since as although though")
 _CONDITIONS: Final = word_set("if whether when once until unless before after while")
@@ -125,14 +125,11 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
         return ClauseType.STATEMENT
     if not clause or (opener[1] is Tag.CLAUSE_BREAK and opener[0] in _CONDITIONS):
         return ClauseType.REQUEST
-    is_statement = clause[0][0] in _UNKNOWN_PEOPLE and len(clause) > 1 and clause[1][1] in _PREDICATES
+    is_statement = clause[0][0] in UNKNOWN_PEOPLE and len(clause) > 1 and clause[1][1] in _PREDICATES
     is_question = (clause[0][1] in _QUESTION_OPENERS or clause[0][0] == "which") and not is_statement
     if is_question or any(_is_request(tagged, index) for index in range(first, end)):
         return ClauseType.REQUEST
     # "bring the hammer. And the nails."
-    after = [*tagged[end : end + 3], *[(";", Tag.CLAUSE_BREAK)] * 3]
-    if after[0][0] == ":" and (after[1][1], after[2][1]) == (Tag.VERB, Tag.CLAUSE_BREAK):
-        return ClauseType.REQUEST  # "crane hook: inspect"
     elliptic = not any(tag in (Tag.AUXILIARY, Tag.VERB, Tag.PRONOUN) for _, tag in clause)
     # "there are two sinks. The one near the door."
     names = clause[0][1] in (Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE) and opener[1] is Tag.CLAUSE_BREAK

@@ -12,7 +12,6 @@ from gausslite_language.lexicon import SUPERLATIVES, is_attribute
 from gausslite_language.roles import RoleAssigner
 from gausslite_language.tokens import UNBOUNDED
 
-# "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
 _SPACE_PREPOSITIONS = frozenset(
     {"at", "around", "throughout", "across", "on", "near the middle of", "along", "through"}
@@ -20,7 +19,6 @@ _SPACE_PREPOSITIONS = frozenset(
 _THOSE_THERE = [ChunkKind.DEMONSTRATIVE, ChunkKind.PREPOSITION]
 # after a negation: "open no door except the red one"
 _EXCEPTIONS = ("except", "besides", "apart", "aside", "other", "but", "save", "barring")
-_ADDRESSED_ROBOTS = (("drone",), ("rover",))
 
 
 def build_draft(chunks: Sequence[Chunk]) -> GraphDraft:
@@ -242,9 +240,7 @@ class GraphBuilder:
             self._clause.nouns_since_negation += 1
             return
         names_more = self._pending is None and after is not None and after.kind is ChunkKind.PREPOSITION
-        # "you are in a kitchen. leave it"
-        left = self._clause.verb in verbs.LEAVING_VERBS and bool(self._draft.context)
-        if left or (self._clause.verb is None and self._pending is None) or (names_more and self._clause.objects):
+        if (self._clause.verb is None and self._pending is None) or (names_more and self._clause.objects):
             return  # "the tiles, especially those behind the toilet"
         self._draft.unnamed = self._draft.unnamed or word
         if self._pending is None:
@@ -252,8 +248,6 @@ class GraphBuilder:
         self._pending = None
 
     def _noun(self, before: Chunk | None, noun: NounPhrase, after: Chunk | None) -> None:
-        if noun.words in _ADDRESSED_ROBOTS and not (noun.has_determiner or self._clause.verb or self._pending):
-            return
         conjoined = before is not None and before.kind is ChunkKind.CONJUNCTION
         self._clause.is_alternative = conjoined and before is not None and before.word == "or"
         contrasts = self._corrects or (before is not None and before.word in ("but", "("))
@@ -264,18 +258,11 @@ class GraphBuilder:
                 self._negate_latest()  # "this mug, not that one"
                 return
             noun = self._resolve_one(noun, before)
-        excepts = after is not None and after.kind is ChunkKind.NEGATION and noun.text == "object"
-        if excepts and conjoined and self._clause.objects and self._pending is None:
-            return  # "bring me a snack, anything but chips"
         pending, self._pending = self._pending, None
         is_picture = bool(self._described) and (self._described or "").split()[-1] in lexicon.PICTURES
         if pending == "of" and not self._clause.skip_of_phrase and is_picture:
             self._draft.warnings.append(f"what {self._described!r} shows is not understood: {noun.text!r} is dropped")
             return
-        longer = [phrase for phrase in self._draft.targets if phrase.endswith(f" {noun.text}")]
-        repeats = noun.is_definite and noun.has_determiner and noun.text not in self._draft.mentions
-        if pending is None and repeats and len(longer) == 1:
-            noun = phrase_from_text(longer[0])  # "take the alarm clock and look at the clock"
         if self._partitive is not None and pending in (None, "of"):
             (superlative, pending, conjoined), self._partitive = self._partitive, None
             noun = NounPhrase((*superlative.words, *noun.words), True)
@@ -359,7 +346,8 @@ class GraphBuilder:
         elif noun.head in lexicon.PLACES and pending is None:
             self._draft.whole_place = noun.text
         self._clause.inherited_preposition = pending if of_follows else None
-        self._clause.inherits_goal = pending == "to" and not of_follows  # "to the spot behind the truck"
+        enters = pending is None and self._clause.verb in verbs.REACHING_VERBS
+        self._clause.inherits_goal = (pending == "to" or enters) and not of_follows  # "to the spot behind the truck"
         self._clause.skip_of_phrase, self._clause.inherited_conjoined = of_follows, conjoined
 
     def _negate_latest(self) -> None:

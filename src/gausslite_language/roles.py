@@ -140,8 +140,6 @@ class RoleAssigner:
             self._relations.relate("near", noun)  # "the man talking to the nurse"
         elif pending == "purpose":
             clause.last_relation = "with"  # where a door leads or what a key opens
-        elif noun.head in lexicon.BODY_PARTS and pending in ("near", "inside", "on") and self._acts_on_people():
-            return  # "raising their arm"
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
             self._relations.relate("near", noun)
         elif self._assign_on_route(pending, noun):
@@ -160,11 +158,7 @@ class RoleAssigner:
         clause = self.clause
         by_route, aimless = clause.preposition in _ROUTE_PREPOSITIONS, not (clause.objects or clause.pending_places)
         moves_by = (by_route or clause.preposition == "by") and clause.verb in _PASSING_VERBS
-        if (pending in ("past", "beyond") and clause.verb in verbs.DELIVERY_VERBS - verbs.PLACE_VERBS) or (
-            by_route and clause.verb in verbs.LEADING_VERBS and clause.objects
-        ):
-            self._draft.add_target(noun.text)
-        elif (
+        if (
             (moves_by and (clause.adds_place or aimless))  # "walk by the bathroom, by the bedroom"
             or (pending == "past" and clause.verb in verbs.TRAVEL_VERBS)
             or (pending == "with" and clause.verb in _PAIRING_VERBS)
@@ -179,6 +173,10 @@ class RoleAssigner:
         clause = self.clause
         if clause.verb in verbs.FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
+            return
+        if clause.inherits_goal and noun.is_definite:
+            clause.inherits_goal = False
+            self._destination(noun)  # "to the area with the cones"
             return
         if self._describes_room(noun):
             return  # "in the bathroom with two sinks"
@@ -383,12 +381,6 @@ class RoleAssigner:
 
     def _destination(self, noun: NounPhrase) -> None:
         clause = self.clause
-        latest = self._draft.mentions[-1] if self._draft.mentions else ""
-        is_passage = latest.split()[-1:] and latest.split()[-1] in lexicon.PASSAGES
-        if (clause.verb in verbs.STOPPING_VERBS and clause.pending_places) or (
-            is_passage and self._draft.roles.get(latest) is TargetRole.DESTINATION
-        ):
-            return  # "stop by the doorway to the bedroom"
         if clause.verb in verbs.TRAVEL_VERBS:
             self._make_places_targets(passes=True)  # "between the shelves to the exit"
         if clause.route or not clause.objects or clause.verb in verbs.GO_VERBS - verbs.MOVING_VERBS:
@@ -443,8 +435,6 @@ class RoleAssigner:
             if pending == "from_inside" and not encloses and noun.head not in lexicon.ROOMS:
                 self._assign_waypoint(noun, conjoined=True)  # "out of the back door"
             return
-        if clause.verb is None and any(lexicon.is_ordinal(word) for word in " ".join(clause.objects).split()):
-            return  # "the second chair from the window"
         relation = _ORIGIN_RELATIONS.get(pending, "inside" if encloses else "on")
         if clause.last_relation == "with":
             self._relations.relate_places(RelationTerms(relation), noun)

@@ -14,7 +14,7 @@ from gausslite_language.doubts import lost_nouns, unknown_names
 from gausslite_language.graph_builder import build_draft
 from gausslite_language.graph_draft import GraphDraft
 from gausslite_language.grounding import ParsedPhrases, grounded_graph, normalise_text, task_id_of
-from gausslite_language.spelling import read_typed
+from gausslite_language.spelling import is_in_dictionary, read_typed
 from gausslite_language.tags import is_english, tag_words
 from gausslite_language.tokens import comparisons, lexical_units, tokenize
 from gausslite_language.verbs import ASPECT_VERBS, AVOIDING_VERBS
@@ -80,6 +80,7 @@ def _require_structure(text: str, read: str, chunks: list[Chunk]) -> None:
     words = [word for word in tokenize(normalise_text(text)) if word[0].isalpha()]
     typed = [word for word in words if not is_english(word)]
     unknown = [word for word in tokenize(read) if word[0].isalpha() and not is_english(word)]
+    unknown += filter(is_in_dictionary, typed)
     prepositions = any(chunk.kind is ChunkKind.PREPOSITION for chunk in chunks)
     plain = not prepositions and not any(noun.has_determiner for noun in nouns)
     is_foreign = len(words) > 2 and bool(unknown) and (2 * len(typed) > len(words) or (plain and len(typed) > 1))

@@ -9,15 +9,21 @@ from importlib import resources
 from string import ascii_lowercase
 from typing import Final
 
-from gausslite_language.nouns import vocabulary
+from gausslite_language.lexicon import NOUNS
+from gausslite_language.nouns import is_thing, vocabulary
 from gausslite_language.tags import is_english
-from gausslite_language.verbs import TABLES, word_set
+from gausslite_language.tokens import PREPOSITIONS
+from gausslite_language.verbs import TABLES, VERBS, word_set
 
 _SHORT_FORMS: Final[dict[str, str]] = TABLES["abbreviations"]
 _SHORT_FORM: Final = re.compile(rf"(?<![\w/'-])(?:{'|'.join(map(re.escape, _SHORT_FORMS))})(?![\w/'-])")
 _CONTRACTIONS: Final = frozenset(word for word in _SHORT_FORMS if len(word) > 4 and word.isalpha())
 _NAME: Final = re.compile(r"(?<=[\w,] )[A-Z]\w+")
-_WORD: Final = re.compile(r"(?<![\w'])[^\W\d_]{3,}(?![\w'])")
+_WORD: Final = re.compile(r"(?<![\w'-])[^\W\d_]{3,}(?![\w'-])")
+# "an aple", "the flor and": words after an article, at the end of the phrase
+_LAST: Final = re.compile(rf"\b(?:an?|the|my) (\w+)(?=$|[,.;!?]| (?:{'|'.join(sorted(PREPOSITIONS))}|and|or|is|are)\b)")
+_COMMON: Final = NOUNS | VERBS
+_RARER: Final = 20  # how much more often the common word occurs
 _LISTED: Final = frozenset().union(*(word_set(line) for line in TABLES.values() if isinstance(line, str)))
 
 
@@ -35,7 +41,8 @@ def read_typed(text: str, normalised: str) -> Reading:
     plain = _SHORT_FORM.sub(lambda match: _SHORT_FORMS[match[0]], normalised)
     words = dict.fromkeys(_WORD.findall(plain))
     unknown = [word for word in words if word not in names and not is_english(word)]
-    corrected = {word: nearest for word in unknown if (nearest := nearest_word(word)) is not None}
+    last = {match[1] for match in _LAST.finditer(plain)}
+    corrected = {word: nearest for word in unknown if (nearest := nearest_word(word, word in last)) is not None}
     # a text of strange words is not English with typing errors
     if len(unknown) - len(corrected) > len(words) - len(unknown):
         corrected = {}
@@ -45,20 +52,22 @@ def read_typed(text: str, normalised: str) -> Reading:
 
 
 @functools.lru_cache(maxsize=1024)
-def nearest_word(word: str) -> str | None:
-    """Return the known word that is one typing error away; None for an English word, and without such a word."""
+def nearest_word(word: str, ends_phrase: bool = False) -> str | None:
+    """Return the known word that is one typing error away, a noun if it ends a phrase; None without such a word.
+
+    For an English word that no list has, only a common word counts from which letters are missing: "flor", "truk".
+    """
     frequencies = _frequencies()
-    if word in frequencies:
-        return None
     near = _with_one_error(word) & (frequencies.keys() | vocabulary().senses.keys() | _CONTRACTIONS)
     usable = [known for known in near if is_english(known) or known in _CONTRACTIONS]
+    if word in frequencies:
+        least = _RARER * frequencies[word]
+        usable = [known for known in near & _COMMON if frequencies.get(known, 0) > least and _error(word, known) < 2]
     found = min(
         usable,
         key=lambda known: (
-            _error(word, known),
-            known not in _LISTED | _CONTRACTIONS,
-            -frequencies.get(known, 0),
-            known,
+            *(ends_phrase and (known[0] != word[0] or not (known in NOUNS or is_thing(known))), _error(word, known)),
+            *(known not in _LISTED | _CONTRACTIONS, -frequencies.get(known, 0), known),
         ),
         default="",
     )

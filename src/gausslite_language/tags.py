@@ -111,10 +111,13 @@ _AVOIDS: Final = word_set("avoid avoiding evade evading")
 _STOPS: Final = word_set("stop stopping quit quitting cease ceasing")
 _ENTERED: Final = word_set("on above past inside to from")
 _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
-_MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
 _USUALLY_VERBS: Final = verbs.GO_VERBS | verbs.TOOL_VERBS | verbs.SEARCH_VERBS | word_set("stop hand")
 _NEVER_NOUNS: Final = verbs.GO_VERBS | verbs.words("never_nouns")
 # at the start of a clause no things: "stand in front of", "swing left", "stock the shelf"
+_ENDS: Final = frozenset({Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
+_MODIFIERS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE, Tag.PARTICIPLE})
+_PLACES: Final = word_set("near on inside under above behind in_front_of")
+_INTERJECTIONS: Final = word_set("just please pls plz")
 _MOTIONS: Final = verbs.GO_VERBS | verbs.STOPPING_VERBS | word_set("turn pass")
 _ARTICLES: Final = frozenset({"a", "an", "the", "my", "your", "every"})
 _SUBJECTS: Final = word_set("it they he she i we")
@@ -122,11 +125,12 @@ _BE: Final = word_set("is are was were")
 _OBJECTS_OF_VERBS: Final = word_set("the a an my it them up")
 _BEFORE_NAMES: Final = _ARTICLES | word_set("to at in near from")
 _FINITE: Final = word_set("is are was were has have can will")
+_AFTER_NAMES: Final = (_FINITE | PREPOSITIONS.keys() | {"", ",", "."}) - {"to"}
 _BEFORE_OBJECTS: Final = lexicon.DETERMINERS | {"no"}
 _DEMONSTRATIVES: Final = word_set("this these those")
 _AROUND: Final = word_set("around under behind along between beneath")
 _THE: Final = _ARTICLES | word_set("this these those his her its our their")
-_OPENERS: Final = frozenset({"", ",", ".", ";", "and", "then"})
+_OPENERS: Final = frozenset({"", ",", ".", ";", ":", "and", "then"})
 _TURNS: Final = word_set("left right around back up down forward backward straight here there")
 _BELONG: Final = word_set("go belong")
 _MODIFIER_ENDINGS: Final = ("ing", "ed")
@@ -153,10 +157,29 @@ _CLOSED: Final[dict[str, Options]] = (
 
 def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
     """Return the words with their part-of-speech tags; adverbs are dropped, because no graph needs them."""
-    kept = [unit for unit in units if not is_adverb(unit)]
+    kept = [unit if not is_adverb(unit) else ";" for at, unit in enumerate(units) if _is_kept(units, at)]
     later = (kept[at + 2 : at + 4] if kept[at + 1 : at + 2] != ["the"] else [] for at in range(len(kept)))
     neighbours = zip(["", *kept], kept, [*kept[1:], ""], later, strict=False)
-    return _deny_gerunds(list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True)))
+    tagged = list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True))
+    places = [at for at in range(len(tagged)) if _names_place(tagged, at)]
+    return _deny_gerunds([(word, Tag.NOUN if at in places else tag) for at, (word, tag) in enumerate(tagged)])
+
+
+def _is_kept(units: Sequence[str], at: int) -> bool:
+    """Return False for an adverb, unless it starts an instruction: "avoid the stairs just get the ball"."""
+    starts = units[at] in _INTERJECTIONS and at > 0 and _is_noun(units[at - 1])
+    return (starts and units[at + 1 : at + 2] != [] and units[at + 1] in verbs.VERBS) or not is_adverb(units[at])
+
+
+def _names_place(tagged: Sequence[tuple[str, Tag]], at: int) -> bool:
+    """Return True for a gerund that ends a bare place: "in visitor parking", "near shipping"."""
+    if tagged[at][1] is not Tag.GERUND or (at + 1 < len(tagged) and tagged[at + 1][1] not in _ENDS):
+        return False
+    start = at - 1
+    while start >= 0 and tagged[start][1] in _MODIFIERS and singular(tagged[start][0]) == tagged[start][0]:
+        start -= 1
+    word, tag = tagged[max(start, 0)]
+    return tag is Tag.PREPOSITION and word != "by" and PREPOSITIONS.get(word) in _PLACES
 
 
 def _deny_gerunds(tagged: list[tuple[str, Tag]]) -> list[tuple[str, Tag]]:
@@ -203,12 +226,12 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (word in verbs.RESTING_VERBS and is_place and _is_noun(before) and singular(before) != before)
         or (opens and word in verbs.TOOL_VERBS and after in _AROUND)
         or (opens and word in verbs.INSPECTION_VERBS and _is_noun(after) and not is_thing(f"{word} {singular(after)}"))
+        or (opens and word in verbs.DELIVERY_VERBS and _is_moved(word, after, later))  # ", stack boxes on"
         or (opens and word in _MOTIONS and (is_place or after in _TURNS))
         or (word in verbs.PLACE_VERBS and before in ("and", "then") and is_place)
         or (opens and is_open and word in verbs.VERBS and after in _BEFORE_OBJECTS)
         or (opens and is_open and after in _THE and not word.endswith(_MODIFIER_ENDINGS))  # "fluff the pillow"
         or (opens and word in verbs.VERBS and after in _VERB_PARTICLES)  # "switch off"
-        or (word in _BELONG and is_place and verbs.base_of_ed(before) is not None)  # "that were washed go in"
         or (before in ("which", "that", "who") and is_place and verbs.base_of_s(word) is not None)  # "which stands on"
         or (before == "you" and is_open and after in lexicon.DETERMINERS)
     )
@@ -227,13 +250,20 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (opens and is_open and after in _BELONG and singular(word) != word)  # "drinks go on the shelf"
         or (before in _DEMONSTRATIVES and word in verbs.VERBS and after in PREPOSITIONS and not _describes(word))
         or (word.endswith("ing") and named)
+        or (word == "can" and after not in verbs.VERBS and (after in _AFTER_NAMES or _describes(after)))
         or (word == "half" and after == "of"),  # "stand lamp"
         Tag.PREPOSITION: word == "outside" and after in lexicon.DETERMINERS,
         Tag.GERUND: verbs.base_of_ing(word) is not None and (before in ("without", *_BE) or before in denying),
-        Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
-        Tag.DETERMINER: word == "one" and after == "of",
+        Tag.DETERMINER: (word == "one" or word.isdecimal()) and after == "of",
     }
     return next((tag for tag, holds in rules.items() if holds), None)
+
+
+def _is_moved(verb: str, noun: str, later: Sequence[str]) -> bool:
+    """Return True if a bare plural follows the verb, at once or after one word, and then where it goes."""
+    plural, place = (noun, later[:1]) if later[:1] and later[0] in PREPOSITIONS else ("".join(later[:1]), later[1:])
+    goes = place and place[0] in PREPOSITIONS and PREPOSITIONS[place[0]] not in ("of", "from", "for", "with")
+    return bool(goes) and singular(plural) != plural and not is_thing(f"{verb} {singular(noun)}")
 
 
 def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Options:
@@ -255,7 +285,8 @@ def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Op
     is_noun = _is_noun(word)
     options = _verb_options(before, word, is_noun)
     follows_singular = _is_noun(before) and singular(before) == before
-    if Tag.VERB in options and not is_noun and follows_singular and after in _OBJECTS_OF_VERBS:
+    has_object = after in _OBJECTS_OF_VERBS or (_is_noun(after) and word in verbs.words("never_nouns"))
+    if Tag.VERB in options and not is_noun and follows_singular and has_object:
         options[Tag.VERB] = -10  # no subject of this form: "the table pick up the cup"
     if _describes(word):
         options[Tag.ADJECTIVE] = 0

@@ -142,14 +142,10 @@ _PLAIN: Final = {
     r"(left|right|top|bottom|upper|lower)[ -]most": r"\1most",
     r"^whose": "the",
     r",? ?(?:which|that) belongs? to (?:the |my )?[\w']+,?": "",
-    r"belonging to": "of",
-    r"in (?:your|my) hands?|(?:(?:that|which) )?you(?: are)? (?:holding|carrying)": "",
     r"^the (?:target|goal|object|item)(?: object)? is(?= (?:an?|the|my|one)\b)": "this is",
-    r"^(?:if|when) you (?:are )?(?:stand|sit|enter)\w*[^,;.]*,": "",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
     r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
-    rf",? (?:but )?(?:no|not) (?:closer|nearer|farther|further) than {_VALUE} ?{_UNIT}{_END}": "",
     rf"^(?:[\w ]* )?(?:which|what) (\w+(?: \w+)?) (?:(?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?)|"
     rf"((?:the|my|your) [\w ]{{2,30}}?) (?:is|are))(?: \w+ing)? ({_PLACED}|against)$": (
         r"find the \1 and \2\3 \4 the \1"
@@ -192,7 +188,6 @@ _PLAIN: Final = {
     r"(?:until|till|so that|so) (the|an?) ([\w ]{2,30}?) is(?= (?:on|to|at) your| behind you| in front of you)": (
         r"and pass \1 \2"
     ),
-    r"with your (?:back|left|right)(?: side)? (?:to|towards?|against) (.{2,40}?),": r"pass \1;",
     r"so(?: that)? you(?: are)? fac(?:e|ing)": "; face",
     r"(?:is |are )?made (?:out )?of (?:(?:solid|dark|light) )?\w+": "",
     r"(?:could|can|would|will) (?:someone|somebody|anyone|anybody|one of you)|"
@@ -201,7 +196,6 @@ _PLAIN: Final = {
     r"throw ((?:[\w']+ ){1,9})(?:away|out)(?=$| ?[,.;]| and )": r"remove \1",
     r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)|back(?= where\b)": "",
     r"(?:on top|at the (?:head|foot))(?! of\b)": "",
-    rf"to (?:dry|cool|soak|thaw|rest)(?: off| down)?(?= {_PLACED})": "",
     r"on the (?:left|right)(?=,? (?:and )?the\b)|upside down|(?:how|what) about(?= \w+ing\b)|any ?(?:more|longer)": "",
     r"why (?:don't|do not|not)(?: you| we)?": "please",
     r"is it (?:\w+ ){1,2}to(?= \w)|(?:some|any)thing wrong with|do(?:es)? (?:any|some)(?:one|body) know": "",
@@ -221,30 +215,25 @@ _PLAIN: Final = {
     r"(^|[,;.] |and |but )((?:[\w-]+ ){1,4}?)(?:(?:(?:can|may|should|must) be|is|are) )?(?:excepted|excluded|ignored|"
     rf"skipped|left out|omitted|can wait){_END}": r"\1ignore \2",
     r"(?:i (?:would )?(?:love|like|appreciate|prefer) it|it would be \w+) if": "please",
-    r"hold(?: position)?(?= (?:at|by|near)\b)": "stop",
     r"i think(?: it)? is": "it is",
     r"i (?:do not|don't) mean": "not",
-    r"i wanted": "i want",
     r"i(?: am)? (?:looking|searching)(?: for)?": "find",
-    r"((?:make|take) an? (?:\w+ )?(?:photo|picture|video|image|scan)) from": r"\1 of",
     r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
-    r"(?:as|so) long as|provided(?: that)?": "if",
     rf"{_LIMIT} (?:once|twice)|(?:{_LIMIT} )?{_VALUE} times|{_LIMIT}(?= {_VALUE} (?!{_UNIT}\b))": "",
-    r"[.,;] (?:location|position|place)(?: is)?:": "",
     r"after (?:that|this)(?= \w)": "then",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
         "handle"
     ),
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)|"
     r"(?:^|(?<=[.;,] ))you (?:will )?(?:see|find|notice)": "i see",
+    r"(?<=\w )you will (?:see|find|notice)(?= (?:the|an?)\b)": "; i see",
     r"reach(?:ing)? for": "grab",
     r"(?:head|make|leave|set off|set out) for(?= (?:the|a|an|my|that|this)\b)": "go to",
     r"(where|how|what|who)'d": r"\1 did",
     r"take (?:a|two|three|\d+) (?:\w+ )?steps?": "go",
     r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
-    r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
-    # light verbs, whose noun carries the meaning
+    r"(?<!^)(?<!^ok )so(?: that)?(?= (?:i|you|we|s?he|they|it|the|my|our|no(?:body)?|people|every\w+)\b)": "because",
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
@@ -255,6 +244,9 @@ _PLAIN: Final = {
     r"make sure (?:not to|you don't|to not)|there is no need (?:for you )?to|try not to|avoid to": "do not",
     r"^(\w+) nothing": r"do not \1 anything",
     r"(?:keep (?:your|the) )?(?:hands|fingers) (?:off|away from)": "do not touch",
+    r"prevent (.{2,40}?) to(?= \w)": r"find \1, do not",
+    r"in the middle of (?=(?:the|an?) [\w ]{2,30} and (?:the|an?) )": "between ",
+    r"(?:keep|stop|prevent) (.{2,40}?) (?:from(?= \w+ing\b)|off(?= (?:the|my|an?)\b))": r"find \1, do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
     r"(?:stay|keep) out of": "avoid",
@@ -265,7 +257,6 @@ _PLAIN: Final = {
     r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",
     rf"(?:keep|stay|remain)(?:ing)? (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
     r"not (?:\w+ )?far (?:away )?from": "near",
-    r"(\w+) number (?:\d+|one|two|three|four|five)": r"\1",
     rf"(?:\w+ (?:floor|level|story))(?= (?:\w+room|{'|'.join(lexicon.ROOMS)})\b)": "",
     r"(?:is|are|am|have run|has run|ran)(?: almost)? out of (?!the\b|my\b)\w+": "is empty",
     r"until you (?:see|find|spot|notice|come to|get to|hit)": "until you reach",
@@ -279,8 +270,6 @@ _PLAIN: Final = {
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
     r"((?:every|any)(?:thing|one)?|all|(?:every|all|any) (?:\w+ ){0,2}\w+(?= but (?:the|an?|my)\b)) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
-    # the last noun carries the meaning
-    r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
 _IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
 _COLOUR: Final = "|".join(sorted(COLOURS))
