@@ -68,8 +68,7 @@ class Splats:
         columns = (self.means_m, self.quats_wxyz, self.scales_m, self.opacities, self.rgb)
         means_m, quats, scales_m, opacities, rgb = (np.ascontiguousarray(values, np.float32) for values in columns)
         n, positive_m = len(means_m), np.maximum(scales_m, np.finfo(np.float32).tiny)
-        kappa, target = np.zeros(n, np.uint32), np.full(n, NO_TARGET, np.int16)
-        active = np.zeros(n, np.bool_)
+        active, kappa, target = np.zeros(n, np.bool_), np.zeros(n, np.uint32), np.full(n, NO_TARGET, np.int16)
         return Gaussians(means_m, quats, positive_m, opacities, rgb, active=active, kappa=kappa, target=target)
 
 
