@@ -39,6 +39,9 @@ from gausslite.perception.surface import SurfaceVotes
 
 _MAX_REPORTED = 100
 """Of one robot: 14 kB in a report."""
+_FINE_RADIUS_M = 0.25
+"""Larger things keep no votes on their surface, and their boxes are those of cells of 5 cm: votes on all take 13 MB in
+a kitchen, and boxes in cells hide that a book on a table is gone."""
 _SAME_IOU = 0.4
 """Of the boxes of one thing under two names; a thing on or in another one has less."""
 _MAX_RATIO = 2.5
@@ -78,10 +81,13 @@ class LightObjects:
     def _observe(self, frame: Frame, detections: Sequence[Detection]) -> None:
         named = [replace(found, phrase=normalised_noun(found.class_name)) for found in detections if not found.is_weak]
         lifted = lift_detections(named, frame.depth_m, frame, self._up)
-        # without votes on the surface, which a mask needs and a box does not: 13 MB in a kitchen
-        observations = [replace(observation, votes=SurfaceVotes.empty()) for _, observation in lifted]
         with self._lock:
-            self._seen.observe(observations, VisibilityCheck(frame, frame.depth_m).is_visible)
+            self._seen.observe(
+                [observation for _, observation in lifted], VisibilityCheck(frame, frame.depth_m).is_visible
+            )
+            for landmark in self._seen.objects:
+                if landmark.radius_m > _FINE_RADIUS_M:
+                    landmark.votes = SurfaceVotes.empty()
 
     def beside(self, objects: Sequence[ObjectLandmark]) -> list[ObjectLandmark]:
         """Return the objects of two independent views that are none of these, each under its most confident name."""
