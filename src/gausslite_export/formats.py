@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.codec.ply import left_out_note, write_ply
+from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
@@ -115,7 +115,7 @@ def read_map(
     if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
-    notes: tuple[str, ...] = (left_out_note(stored),) if stored.left_out else ()
+    notes = stored.notes
     if len(gaussians) < len(stored.gaussians):
         far = len(stored.gaussians) - len(gaussians)
         notes += (

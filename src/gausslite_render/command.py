@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.cli.progress import progress_bar
-from gausslite.codec.ply import StoredMap, left_out_note
+from gausslite.codec.ply import StoredMap
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.command_parser import bounded
 from gausslite.datasets.camera_files import read_camera_file
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     _prepare(options, kinds)
     print_message(f"reading {options.map}")
     splats = read_splats(options.map)
-    for note in (left_out_note(splats) if splats.left_out else "", _lens_note(views), _summary(splats)):
+    for note in (*splats.notes, _lens_note(views), _summary(splats)):
         if note:
             print_message(note)
     writer = _Writer(options.out, kinds, options.depth_units, float(options.background == "white"))

@@ -39,6 +39,7 @@ _MAX_HEADER_BYTES = 1 << 16
 _WORLD_FRAME_COMMENT = "comment world_frame "
 # the closest to 0 and 1 that a float32 sigmoid still distinguishes from them
 _OPACITY_EDGE = 1e-6
+_NORMALS = "nx", "ny", "nz"  # 3DGS writes them as zeros
 _POSITIONS, _COLOURS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES, _ROTATIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 _STANDARD = (*_POSITIONS, *_COLOURS, "opacity", *_SCALES, *_ROTATIONS)
@@ -66,8 +67,19 @@ class StoredMap:
     gaussians: Gaussians
     world_frame: str  # empty for an unnamed one
     harmonics: Float32[ndarray, "n 3 k"]
-    left_out: int = 0  # how many rows are left out, and why in words; empty for a whole file
+    left_out: int = 0  # how many rows are left out
     reason: str = ""  # why they are left out, in words
+    unused: tuple[str, ...] = ()  # columns that say what a map here does not hold
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is left out of the file, one line each."""
+        total = self.left_out + len(self.gaussians)
+        rows = f"left out {self.left_out} of {total} Gaussians: {self.reason}" if self.left_out else ""
+        columns = f"left out {len(self.unused)} columns that no map here has: {', '.join(self.unused[:3])}"
+        if len(self.unused) > 3:
+            columns += ", …"
+        return tuple(filter(None, (rows, columns if self.unused else "")))
 
 
 def write_ply(
@@ -86,8 +98,8 @@ def read_ply(path: Path, warn: Callable[[str], object] = warnings.warn) -> Gauss
     warn: called with a line on what is left out. Raises MapFileError naming the file and the cause.
     """
     stored = read_stored_map(path)
-    if stored.left_out:
-        warn(f"{path}: {left_out_note(stored)}")
+    for note in stored.notes:
+        warn(f"{path}: {note}")
     if stored.harmonics.any():
         warn(f"{path}: left out {HARMONICS}: a Gaussian has one colour here; `gausslite render` shows all")
     return stored.gaussians
@@ -97,12 +109,6 @@ def read_stored_map(path: Path) -> StoredMap:
     """Read a map and its world frame. Raises MapFileError naming the file and the cause."""
     with _open_map(path) as file:
         return _stored_map(file.read())
-
-
-def left_out_note(stored: StoredMap) -> str:
-    """Return the message on rows that are left out."""
-    total = stored.left_out + len(stored.gaussians)
-    return f"left out {stored.left_out} of {total} Gaussians: {stored.reason}"
 
 
 def read_world_frame(path: Path) -> str:
@@ -161,7 +167,7 @@ def gaussians_from_ply(data: bytes) -> Gaussians:
 
 def _stored_map(data: bytes) -> StoredMap:
     """Decode a PLY file; rows that are no Gaussians are left out. Raises MapFileError, also if no row is left."""
-    columns, count = _read_columns(data)
+    columns, count, unused = _read_columns(data)
     with np.errstate(over="ignore", invalid="ignore"):
         gaussians = _to_gaussians(columns, count)
     converted = np.concatenate(
@@ -175,13 +181,13 @@ def _stored_map(data: bytes) -> StoredMap:
         finite[_REST] = np.isfinite(harmonics).all(axis=(1, 2))
     broken = [name for name, values in finite.items() if not values.all()]
     if not broken:
-        return StoredMap(gaussians, world_frame_from_ply(data), harmonics)
+        return StoredMap(gaussians, world_frame_from_ply(data), harmonics, unused=unused)
     kept = np.logical_and.reduce(list(finite.values()))
     reason = f"column {broken[0]}: expected finite values, got NaN or infinity"
     if not kept.any():
         raise MapFileError(reason)
     left_out = int(np.count_nonzero(~kept))
-    return StoredMap(gaussians.take(kept), world_frame_from_ply(data), harmonics[kept], left_out, reason)
+    return StoredMap(gaussians.take(kept), world_frame_from_ply(data), harmonics[kept], left_out, reason, unused)
 
 
 def _to_gaussians(raw: Mapping[str, NDArray[Any]], count: int) -> Gaussians:
@@ -208,8 +214,8 @@ class _Element:
     has_list: bool = False  # its rows differ in size
 
 
-def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
-    """Return the columns of a map that the file has, by name, and the number of rows. Raises MapFileError."""
+def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int, tuple[str, ...]]:
+    """Return a map's columns in the file by name, the number of rows, and other columns. Raises MapFileError."""
     file_format, elements, start = _read_header(data)
     names = [element.name for element in elements]
     if "vertex" not in names:
@@ -224,11 +230,12 @@ def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
     rest = [f"{_REST}{i}" for i in range(sum(name.startswith(_REST) for name in vertex.fields))]
     if len(rest) not in _REST_COUNTS or not vertex.fields.keys() >= set(rest):
         rest = []
+    unused = tuple(name for name in vertex.fields if name not in {*present, *rest, *_NORMALS})
     if file_format == _ASCII:
         table = _ascii_rows(data[start:], sum(element.count for element in before), vertex)
         places = {name: place for place, name in enumerate(vertex.fields)}
         harmonics = table[:, [places[name] for name in rest]].astype(np.float32)
-        return {**{name: table[:, places[name]] for name in present}, _REST: harmonics}, vertex.count
+        return {**{name: table[:, places[name]] for name in present}, _REST: harmonics}, vertex.count, unused
     for element in (*before, vertex):
         if element.has_list:
             raise MapFileError(f"element {element.name}: expected columns of one size up to the vertices, got a list")
@@ -240,7 +247,7 @@ def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
         raise MapFileError(f"expected {vertex.count} Gaussians of {row.itemsize} bytes, got {got}")
     rows = np.frombuffer(data, row, vertex.count, start)
     harmonics = structured_to_unstructured(rows[rest], np.float32) if rest else np.zeros((vertex.count, 0), np.float32)
-    return {**{name: rows[name] for name in present}, _REST: harmonics}, vertex.count
+    return {**{name: rows[name] for name in present}, _REST: harmonics}, vertex.count, unused
 
 
 def _row_type(element: _Element, byte_order: str) -> np.dtype[np.void]:

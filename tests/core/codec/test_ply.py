@@ -7,6 +7,7 @@ from pathlib import Path
 
 import gaussforge
 import numpy as np
+import numpy.lib.recfunctions as rfn
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +17,7 @@ from gausslite.codec.ply import (
     gaussians_from_ply,
     ply_bytes,
     read_ply,
+    read_stored_map,
     read_world_frame,
     world_frame_from_ply,
     write_ply,
@@ -66,6 +68,15 @@ def test_files_are_exchanged_with_another_tool(tmp_path: Path) -> None:
     assert not read.active.any()
     assert not read.kappa.any()
     assert (read.target == -1).all()
+
+
+def test_columns_that_no_map_has_are_named(tmp_path: Path) -> None:
+    rows = rfn.append_fields(
+        other_tools_rows(), [f"semantic_{i}" for i in range(4)], [np.ones(9, "f4")] * 4, usemask=False
+    )
+    (tmp_path / "map.ply").write_bytes(other_tools_file(rows))
+    [note] = read_stored_map(tmp_path / "map.ply").notes
+    assert note == "left out 4 columns that no map here has: semantic_0, semantic_1, semantic_2, …"
 
 
 def test_columns_are_found_by_name() -> None:
@@ -195,12 +206,12 @@ ROW = np.dtype([(name, "<f4") for name in (*COLUMNS, "rot_0", "rot_1", "rot_2", 
 def other_tools_file(rows: np.ndarray, file_format: str = "binary_little_endian", before: str = "") -> bytes:
     """Return the rows of ROW as another tool writes them; before: header of an element with one row of one float."""
     header = f"ply\nformat {file_format} 1.0\ncomment other tool\n{before}element vertex {len(rows)}\n"
-    header += "".join(f"property float {name}\n" for name in ROW.names or ()) + "end_header\n"
+    header += "".join(f"property float {name}\n" for name in rows.dtype.names or ()) + "end_header\n"
     if file_format == "ascii":
         lines = ["0.5"] * bool(before) + [" ".join(str(float(value)) for value in row) for row in rows.tolist()]
         return (header + "\n".join(lines) + "\n").encode()
     order = ">" if file_format == "binary_big_endian" else "<"
-    return header.encode() + bytes(4 * bool(before)) + rows.astype(ROW.newbyteorder(order)).tobytes()
+    return header.encode() + bytes(4 * bool(before)) + rows.astype(rows.dtype.newbyteorder(order)).tobytes()
 
 
 def other_tools_rows(n: int = 9) -> np.ndarray:
