@@ -44,6 +44,11 @@ _DEPTH_EDGE_PX = 2
 _CONTEXT_WEIGHT = 0.3
 """Weight of pixels around a region."""
 _RATES = replace(ONLINE_RATES, means=2e-4, decay_after_updates=20)
+"""The mapper's rates, those of the means twice the 3DGS rate, with decay from the 20th update of a Gaussian on. A joint
+refinement ends, and its last large steps would remain as noise. Over the 3DGS rates, 500 iterations gain 0.2 dB in the
+region and 1.0 dB over the whole image of the simulated home. The decay gains 0.9 dB in the region (fitted views) on a
+real kitchen with the frames of two robots, and 0.2 dB on simulated homes.
+"""
 
 
 class Refinement:

@@ -127,7 +127,7 @@ class RelationGeometry:
         return RelationGeometry(self._up, side_m)
 
     def between(self, observation: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
-        """Return True within between_m of the line between two anchors of different groups; None without two."""
+        """Return True within _BETWEEN_M of the line between two anchors of different groups; None without two."""
         pairs = list(combinations(anchors[0], 2)) if len(anchors) == 1 else []
         for one, other in combinations(anchors, 2):
             pairs += product(one, other)

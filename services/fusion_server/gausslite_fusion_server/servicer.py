@@ -38,6 +38,7 @@ _log = logging.getLogger(__name__)
 MAX_REPORTED_REJECTIONS = 1000
 _WORKERS, _MAX_WAITING = 4, 1024
 _KEYFRAME_PAUSE = 2.0
+"""Pause after a keyframe is stored, in the time that storing took."""
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
 _ALIGN_PAUSE = 4.0

@@ -37,7 +37,7 @@ HARMONICS = "colours that depend on the view (spherical harmonics above degree 0
 _MAX_GAUSSIANS = 100_000_000
 _MAX_HEADER_BYTES = 1 << 16
 _WORLD_FRAME_COMMENT = "comment world_frame "
-# the closest to 0 and 1 that a float32 sigmoid still distinguishes from them
+# opacities of 0 and 1 would have infinite logits
 _OPACITY_EDGE = 1e-6
 _NORMALS = "nx", "ny", "nz"  # 3DGS writes them as zeros
 _POSITIONS, _COLOURS = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -138,14 +138,16 @@ class Program:
         parser.refuse_unknown(unknown)
 
     def name(self, key: str) -> str:
-        """Return how messages name an option: as a flag, or as a key of the file."""
-        return f"--{key}" if key in self.flags else self.options[key].option.metavar if key in self.positional else key
+        """Return how messages name an option: as a flag, by its placeholder if positional, or as a key of the file."""
+        if key in self.positional:
+            return self.options[key].option.metavar
+        return f"--{key}" if key in self.flags else key
 
     def _add_flag(self, parser: CommandParser, declared: OptionField) -> None:
         flag = f"--{declared.key}"
         details = {"help": option_help(declared)} if declared.plain_type is bool else _argument(declared)
         if declared.key not in self.flags:
-            details["help"] = SUPPRESS  # accepted, but the help shows what changes from run to run
+            details["help"] = SUPPRESS  # accepted but hidden: the help shows only what changes from run to run
         if declared.plain_type is bool:
             parser.add_argument(flag, action="store_true", default=SUPPRESS, **details)
         else:
@@ -227,7 +229,7 @@ class Program:
             parser.error(f"the following arguments are required: {', '.join(missing)}")
 
     def _require_effect(self, options: Namespace, given: _Layer) -> None:
-        """Raise InvalidInputError for an option, not at its default, without effect beside the others."""
+        """Raise InvalidInputError for an option that differs from its default and needs another that is not given."""
         for key, source in given.items():
             declared = self.options[key]
             needed, _, values = declared.option.needs.partition("=")
@@ -262,6 +264,7 @@ class Program:
                 lines.append(to_toml({key: value}).rstrip("\n"))
                 continue
             computed = None if declared.option.computed is None else declared.option.computed(options)
+            # without the empty key and " = "
             shown = _placeholder(declared, quoted=True) if computed is None else to_toml({"": as_plain(computed)})[3:]
             lines.append(f"# {key} = {shown}".rstrip())
         return "\n".join(lines) + "\n"

@@ -44,7 +44,7 @@ class BallRegion:
     radius_m: float
 
     def __post_init__(self) -> None:
-        # larger coordinates exceed float32's precision of a metre
+        # farther out, float32 does not resolve 0.1 m
         limit_m = _MAX_COORDINATE_M
         if not (max(map(abs, self.centre_m)) <= limit_m and 0 < self.radius_m <= limit_m):
             raise InvalidInputError(
@@ -207,8 +207,8 @@ class DetectedImage:
             frame.index,
             frame.rgb,
             tuple(
-                DetectedBox(detection.phrase, detection.score, detection.box_px, detection.rival, detection.is_weak)
-                for detection in detections
+                DetectedBox(each.phrase, each.score, each.box_px, each.rival, each.is_weak, each.class_name)
+                for each in detections
             ),
         )
 

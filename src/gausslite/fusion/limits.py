@@ -84,7 +84,7 @@ class Quotas:
     keyframe_pixels: int = 1920 * 1080  # of one image
     keyframe_bytes_per_agent: int = 64 << 20
     kappa_at_join: int = 120_000  # highest kappa of one Gaussian at the agent's first join
-    kappa_per_second: int = 200  # its growth since then: at 4 Hz, 8 iterations train it 32 times a second
+    kappa_per_second: int = 2000  # its growth since then; 32 iterations for each frame at 30 Hz are 1 500
 
     def __post_init__(self) -> None:
         for quota in fields(self):

@@ -1,4 +1,4 @@
-"""Density control: clone, split and prune Gaussians under a hard cap (Sec. III-D.3; 3DGS, Kerbl et al. 2023)."""
+"""Density control: clone, split and prune Gaussians under a hard cap (Sec. III-D.2; 3DGS, Kerbl et al. 2023)."""
 
 from __future__ import annotations
 

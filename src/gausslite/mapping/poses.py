@@ -152,7 +152,7 @@ class PoseTable:
         }
 
     def restore(self, state: State) -> None:
-        """Continue from another history's state. Raises MapFileError, PoseError."""
+        """Continue from another table's state. Raises MapFileError, PoseError."""
         frames = get_array(state, "frames", (None, 2), np.int64)
         poses = [get_array(state, name, (len(frames), 4, 4), np.float64) for name in _POSES]
         anchors = get_counts(state, "anchor", len(frames))

@@ -22,12 +22,6 @@ They decay from the 150th update of a Gaussian on: with constant rates, Gaussian
 iterations make a region worse. A decay from the 50th update on loses 0.3 dB over the whole images of a HoloLens
 recording at 32 iterations per frame.
 """
-
-"""The same rates, those of the means twice the 3DGS rate, with decay from the 20th update of a Gaussian on. A joint
-refinement ends, and its last large steps would remain as noise. Over the 3DGS rates, 500 iterations gain 0.2 dB in the
-region and 1.0 dB over the whole image of the simulated home. The decay gains 0.9 dB in the region (fitted views) on a
-real kitchen with the frames of two robots, and 0.2 dB on simulated homes.
-"""
 BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 

@@ -66,8 +66,8 @@ def _too_large(capacity: int) -> InvalidInputError:
 class SplatTable:
     """Encoded parameters of the Gaussians, their EMA, Adam's two moments and per-Gaussian columns (Sec. III-A).
 
-    `count` never exceeds `capacity`, the cap of Sec. III-D.3. All arrays are views of the first `count` rows; `append`,
-    `append_rows` and `keep` invalidate earlier views.
+    `count` never exceeds `capacity`, the cap (`max-gaussians`). All arrays are views of the first `count` rows;
+    `append`, `append_rows` and `keep` invalidate earlier views.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -143,7 +143,7 @@ class SplatTable:
 
     @property
     def kappa(self) -> UInt32[ndarray, " n"]:
-        """Number of active-phase iterations that trained each Gaussian."""
+        """Steps of the active phase that trained each Gaussian; an iteration has up to `active_views` steps."""
         return self._kappa[: self._count]
 
     @property

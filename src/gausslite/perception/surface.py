@@ -24,7 +24,7 @@ _EXTENT_VOXELS = 12
 """Voxels across an object. Finer ones change no precision by more than 0.03."""
 MAX_VOXELS = 60_000
 MAX_INSIDE_VOXELS = 15_000
-"""Voxels inside a surface from which it is coarsened, if it has more than max_voxels in all."""
+"""Voxels inside a surface from which it is coarsened, if it has more than MAX_VOXELS in all."""
 _PART_CELL_M = 0.05
 """Cells that touch connect the parts of a surface."""
 _MIN_PART_SHARE = 0.2

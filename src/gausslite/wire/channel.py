@@ -47,7 +47,7 @@ _RETRY_POLICY = {
 _METHODS = [{"service": service, "method": name} for service, names in _RETRIED_METHODS.items() for name in names]
 _SERVICE_CONFIG = json.dumps({"methodConfig": [{"name": _METHODS, "retryPolicy": _RETRY_POLICY}]})
 _Response = TypeVar("_Response")
-_DEADLINE_S = 3.0
+_HEALTH_DEADLINE_S = 3.0
 _SERVING = health_pb2.HealthCheckResponse.SERVING
 _MAX_BACKOFF_S = 5.0
 _MAX_RETRY_HINT_S = 60.0
@@ -269,7 +269,7 @@ def _status(address: str, service: str, tls: Tls | None) -> int:
     try:
         with open_channel(address, tls) as channel:
             request = health_pb2.HealthCheckRequest(service=service)
-            return int(health_pb2_grpc.HealthStub(channel).Check(request, timeout=_DEADLINE_S).status)
+            return int(health_pb2_grpc.HealthStub(channel).Check(request, timeout=_HEALTH_DEADLINE_S).status)
     except grpc.RpcError as error:
         if error.code() is grpc.StatusCode.NOT_FOUND:
             return int(health_pb2.HealthCheckResponse.SERVICE_UNKNOWN)

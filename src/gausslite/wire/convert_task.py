@@ -79,7 +79,7 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
-    _require_knownenum_numbers(message)
+    _require_known_numbers(message)
     names = {name: tuple(values) for name, values in values_of(message, _NAMES).items()}
     graph = TaskGraph(
         task_id=message.task_id,
@@ -171,7 +171,7 @@ def _surface_point_from_message(name: str, message: geometry_pb2.Point) -> Point
     return point_m
 
 
-def _require_knownenum_numbers(message: task_pb2.TaskGraph) -> None:
+def _require_known_numbers(message: task_pb2.TaskGraph) -> None:
     for name, kind, numbers, known in (
         ("relation", Predicate, [relation.predicate for relation in message.relations], _PREDICATE_BY_NUMBER),
         ("roles", TargetRole, message.roles, _ROLE_BY_NUMBER),
