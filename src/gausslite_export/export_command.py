@@ -34,7 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
     voxel_help = f"voxel size in metres (default: {_OCCUPANCY.voxel_m:g}; mesh: {MESH_VOXEL_M:g})"
     add("--voxel", metavar="M", type=bounded(float, 0.001, 10), help=voxel_help)
-    opacity_help = f"for octomap and nav2 (default: {_OCCUPANCY.min_opacity:g})"
+    opacity_help = f"for octomap, and for grids without keyframes (default: {_OCCUPANCY.min_opacity:g})"
     add("--min-opacity", metavar="A", type=bounded(float, 0, 1), help=opacity_help)
     add("--seconds", metavar="S", type=bounded(float, 0.1, 600), help=f"length of a video (default: {VIDEO_S:g})")
     add("--spz-version", metavar="N", type=int, choices=SPZ_VERSIONS, help=f"2, 3 or 4 (default: {SPZ_VERSION})")

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from jaxtyping import Float32
+import numpy as np
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
@@ -33,6 +34,8 @@ class MapContent:
     notes: tuple[str, ...] = ()
     world_frame: str = ""
     views: Sequence[KeyframeView] = ()
+    depths_m: Mapping[int, Float32[ndarray, "h w"]] = field(default_factory=dict)
+    T_upright_map: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     report: Mapping[str, object] = field(default_factory=dict)
     harmonics: Float32[ndarray, "n 3 k"] | None = None
 

@@ -22,20 +22,24 @@ from gausslite.domain.pose import transform_of, twist_of
 from gausslite.mission.results import map_file, stated_up
 from gausslite.process import import_extra, print_message
 from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
-from gausslite_export.free_cells import free_voxels
 from gausslite_export.mesh import write_mesh
 from gausslite_export.occupancy import (
     NAV2_IMAGE,
     NO_VOXELS,
+    FloorGrid,
     OccupancySettings,
     occupied_voxels,
+    planar_grid,
     require_voxels,
+    write_distances,
     write_nav2,
     write_octomap,
 )
 from gausslite_export.rerun_file import write_rrd
 from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, SPZ_VERSION, write_gltf, write_packed
+from gausslite_export.surface_votes import SurfaceVotes, count_votes, rendered_depths
 from gausslite_export.video import write_video
+from gausslite_objects.visit import depth_views, read_depths
 from gausslite_render.harmonics import rotated
 from gausslite_render.splat_map import read_splats
 
@@ -115,6 +119,7 @@ def read_map(
     if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
+    depths_m = {} if folder is None else read_depths(folder, views)
     notes = stored.notes
     if len(gaussians) < len(stored.gaussians):
         far = len(stored.gaussians) - len(gaussians)
@@ -131,6 +136,7 @@ def read_map(
         notes=notes,
         world_frame=stored.world_frame,
         views=views,
+        depths_m=depths_m,
         report=report,
         harmonics=kept,
     )
@@ -155,6 +161,7 @@ def upright(content: MapContent) -> MapContent:
         chosen=move_gaussians(content.chosen, T),
         harmonics=None if content.harmonics is None else rotated(content.harmonics, T[:3, :3]),
         views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
+        T_upright_map=T,
         notes=(*content.notes, note),
     )
 
@@ -228,8 +235,40 @@ def _octomap(path: Path, content: MapContent, settings: ExportSettings) -> None:
 
 
 def _nav2(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    write_nav2(path, _floor_grid(content, settings))
+
+
+def _distances(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    write_distances(path, _floor_grid(content, settings))
+
+
+def _floor_grid(content: MapContent, settings: ExportSettings) -> FloorGrid:
+    """Return the grid of what depth images show around the chosen Gaussians; without keyframes, of the Gaussians."""
     content, occupancy = _without_outliers(content), _occupancy(settings)
-    write_nav2(path, content.chosen, occupancy, _free(content, settings, occupancy))
+    if not content.views:
+        return planar_grid(require_voxels(content.chosen, occupancy), NO_VOXELS, occupancy, content.T_upright_map)
+    votes = _votes(content, settings, occupancy)
+    around = np.floor(content.chosen.means_m / occupancy.voxel_m).astype(np.int64)
+    surface = _within(around, votes.surface())
+    if not len(surface):
+        raise InvalidInputError("grid: expected a surface that the keyframes show, found none in the chosen Gaussians")
+    return planar_grid(surface, votes.free(), occupancy, content.T_upright_map)
+
+
+def _within(points: Int64[ndarray, "v 3"], voxels: Int64[ndarray, "n 3"]) -> Int64[ndarray, "m 3"]:
+    """Return the voxels in the box around other ones, with a margin of one voxel."""
+    low, high = points.min(axis=0) - 1, points.max(axis=0) + 1
+    kept: Int64[ndarray, "m 3"] = voxels[((voxels >= low) & (voxels <= high)).all(axis=1)]
+    return kept
+
+
+def _votes(content: MapContent, settings: ExportSettings, occupancy: OccupancySettings) -> SurfaceVotes:
+    """Return what the keyframes' depth images show: the measured ones, or those of the map where none are kept."""
+    if content.depths_m:
+        views, _ = depth_views([*settings.progress(content.views)], content.depths_m)
+        return count_votes(views, occupancy.voxel_m)
+    render = settings.viewer(content.gaussians).render
+    return count_votes(rendered_depths(settings.progress(content.views), render), occupancy.voxel_m)
 
 
 def _occupancy(settings: ExportSettings) -> OccupancySettings:
@@ -243,8 +282,8 @@ def _free(content: MapContent, settings: ExportSettings, occupancy: OccupancySet
     if not content.views:
         return NO_VOXELS
     chosen, occupied = require_voxels(content.chosen, occupancy), occupied_voxels(content.gaussians, occupancy)
-    views, render = settings.progress(content.views), settings.viewer(content.gaussians).render
-    return free_voxels(views, render, chosen, occupied, occupancy.voxel_m)
+    votes = _votes(content, settings, occupancy)
+    return _within(chosen, votes.free(occupied))
 
 
 def _rrd(path: Path, content: MapContent, _settings: ExportSettings) -> None:
@@ -301,6 +340,13 @@ OCTOMAP: Final = Format(
     ".bt", "occupied and free voxels of the region", _octomap, region_only=True, uses=("voxel", "min_opacity")
 )
 NAV2: Final = Format(".yaml", "2D grid", _nav2, companion=NAV2_IMAGE, is_upright=True, uses=("voxel", "min_opacity"))
+ESDF: Final = Format(
+    ".esdf.npz",
+    "2D grid with the distance to the nearest obstacle",
+    _distances,
+    is_upright=True,
+    uses=("voxel", "min_opacity"),
+)
 MESH: Final = Format(
     ".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True, uses=("voxel",)
 )

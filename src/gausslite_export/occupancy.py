@@ -1,7 +1,7 @@
-"""Find the voxels that the Gaussians occupy and write them for planners: OctoMap trees and nav2 grids.
+"""Find occupied and free space and write it for planners: OctoMap trees, nav2 grids, distances to obstacles.
 
-A map of Gaussians holds surfaces; free space is what its keyframes see through (`free_cells`). All other space is
-unknown. Without keyframes a voxel is never free, and a grid cell only where the map has a floor.
+Of a grid, surfaces and free space are what depth images show (`surface_votes`); all other space is unknown. Without
+keyframes, surfaces are the voxels of opaque Gaussians, and a cell is free only where the map has a floor.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from jaxtyping import Float32, Int8, Int64
+from jaxtyping import Bool, Float32, Float64, Int8, Int64
 from numpy import ndarray
 
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import inverse, transform_points
 from gausslite.process import import_extra
 
 _EXTENT_SIGMAS = 1.5
@@ -37,6 +38,10 @@ _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 """Map servers read (255 - grey) / 255 beyond these as occupied and free: 0.1961 for unknown must lie between."""
 _FLOOR_SHARE = 0.25
 """Of the fullest layer of voxels. Ellipsoids of the floor reach below it, but few of them."""
+_SEEN_M, _SEEN_SHARE, _LOWEST_M = 0.9, 0.3, 0.3
+"""A cell without an obstacle is free if images show its floor or see through one of its voxels in the lowest 0.3 m of
+the heights, and see through 30 % of the lowest 0.9 m: over the unseen half of an ottoman they see higher ones only."""
+_SPECK_CELLS = 4
 NO_VOXELS: Int64[ndarray, "0 3"] = np.zeros((0, 3), np.int64)
 
 
@@ -111,31 +116,78 @@ def write_octomap(
     write_atomic_with(path, write)
 
 
-def write_nav2(
-    path: Path, gaussians: Gaussians, settings: OccupancySettings, free: Int64[ndarray, "f 3"] = NO_VOXELS
-) -> None:
-    """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix NAV2_IMAGE.
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorGrid:
+    """Cells in x and y of the upright map, by row (y) and column (x): UNKNOWN, FREE or OCCUPIED, and where they lie.
 
-    The map's z axis must point up. Raises InvalidInputError without an occupied voxel or if the grid is too large,
-    StorageError.
+    origin_m: lower corner of the first cell. floor_m: height of the floor. T_upright_map: turns the map upright.
     """
-    cells, first = planar_grid(require_voxels(gaussians, settings), free, settings)
-    image, origin_m = _GREY_VALUES[cells[::-1]], first * settings.voxel_m
-    encoded, data = cv2.imencode(".pgm", image)
+
+    cells: Int8[ndarray, "h w"]
+    origin_m: Float64[ndarray, "2"]
+    cell_m: float
+    floor_m: float
+    T_upright_map: Float64[ndarray, "4 4"]
+
+    @property
+    def T_map_grid(self) -> Float64[ndarray, "4 4"]:  # noqa: N802 - frames of transforms are named so
+        """The pose of the grid's frame, whose z axis is up and 0 at the floor."""
+        T_upright_grid = np.eye(4)
+        T_upright_grid[2, 3] = self.floor_m
+        return inverse(self.T_upright_map) @ T_upright_grid
+
+    def cell_at(self, point_m: Float64[ndarray, "3"]) -> tuple[int, int] | None:
+        """Return the row and column of a point of the map; None beyond the grid."""
+        upright_m = transform_points(self.T_upright_map, point_m)[:2]
+        column, row = np.floor((upright_m - self.origin_m) / self.cell_m).astype(int).tolist()
+        height, width = self.cells.shape
+        return (row, column) if 0 <= row < height and 0 <= column < width else None
+
+    @property
+    def distance_m(self) -> Float32[ndarray, "h w"]:
+        """The distance from each cell's middle to that of the nearest OCCUPIED cell, infinite without one.
+
+        Inside of obstacles it is 0 or negative: up to the nearest cell at their border. UNKNOWN cells are no obstacles.
+        """
+        occupied = (self.cells == OCCUPIED).astype(np.uint8)
+        if not occupied.any():
+            return np.full(self.cells.shape, np.inf, np.float32)
+        outside, inside = (
+            cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for image in (1 - occupied, occupied)
+        )
+        distance_m: Float32[ndarray, "h w"] = np.where(occupied, np.minimum(1 - inside, 0), outside) * self.cell_m
+        return distance_m.astype(np.float32)
+
+
+def write_nav2(path: Path, grid: FloorGrid) -> None:
+    """Write a nav2 map: `path` is the YAML file, its image has the suffix NAV2_IMAGE. Raises StorageError."""
+    encoded, data = cv2.imencode(".pgm", _GREY_VALUES[grid.cells[::-1]])
     if not encoded:
-        raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {image.shape}")
+        raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {grid.cells.shape}")
     image_path = path.with_suffix(NAV2_IMAGE)
     write_atomic(image_path, data.tobytes())
     description = {
         "image": image_path.name,
         "mode": "trinary",
-        "resolution": settings.voxel_m,
-        "origin": [float(origin_m[0]), float(origin_m[1]), 0.0],
+        "resolution": grid.cell_m,
+        "origin": [*grid.origin_m.tolist(), 0.0],
         "negate": 0,
         "occupied_thresh": _OCCUPIED_THRESHOLD,
         "free_thresh": _FREE_THRESHOLD,
+        "T_map_grid": grid.T_map_grid.tolist(),  # map servers ignore it
     }
     write_atomic(path, yaml.safe_dump(description, sort_keys=False).encode())
+
+
+def write_distances(path: Path, grid: FloorGrid) -> None:
+    """Write the grid with its distances as an .npz file of NumPy. Raises StorageError."""
+    arrays = {name: getattr(grid, name) for name in ("cells", "distance_m", "origin_m", "cell_m", "T_map_grid")}
+
+    def write(partial: Path) -> None:
+        with partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    write_atomic_with(path, write)
 
 
 def require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:
@@ -150,13 +202,16 @@ def require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[n
 
 
 def planar_grid(
-    voxels: Int64[ndarray, "v 3"], free: Int64[ndarray, "f 3"], settings: OccupancySettings
-) -> tuple[Int8[ndarray, "h w"], Int64[ndarray, "2"]]:
-    """Return a grid in x and y, its first row at the lowest y, and the indices (x, y) of its first cell.
+    voxels: Int64[ndarray, "v 3"],
+    free: Int64[ndarray, "f 3"],
+    settings: OccupancySettings,
+    T_upright_map: Float64[ndarray, "4 4"] | None = None,
+) -> FloorGrid:
+    """Return the grid of the upright map's occupied and free voxels.
 
-    It spans the occupied voxels. The floor is their lowest full layer. A cell is OCCUPIED by a voxel at
-    an obstacle's height, else FREE over a floor or with a free voxel at an obstacle's height, else UNKNOWN. Raises
-    InvalidInputError, before memory is taken, for too many cells.
+    It spans the occupied voxels. The floor is their lowest full layer. A cell is OCCUPIED by a voxel at an obstacle's
+    height; else FREE with enough free voxels at these heights, or over a floor if nothing is known to be free; else
+    UNKNOWN. Raises InvalidInputError, before memory is taken, for too many cells.
     """
     first, last = voxels.min(axis=0), voxels.max(axis=0)
     width, height = (int(n) for n in (last - first + 1)[:2])
@@ -167,16 +222,35 @@ def planar_grid(
     floor = floor_layer(voxels)
     above_m, free_above_m = ((found[:, 2] - floor) * settings.voxel_m for found in (voxels, free))
     low_m, high_m = settings.height_m
-    inside = ((free >= first) & (free <= last))[:, :2].all(axis=1)
-    grid = np.full((height, width), UNKNOWN, np.int8)
-    for value, found in (
-        (FREE, free[inside & (free_above_m >= low_m) & (free_above_m <= high_m)]),
-        (FREE, voxels[above_m < low_m]),
-        (OCCUPIED, voxels[(above_m >= low_m) & (above_m <= high_m)]),
-    ):
-        x, y = (found[:, :2] - first[:2]).T
-        grid[y, x] = value
-    return grid, first[:2]
+    inside = ((free >= first) & (free <= last))[:, :2].all(axis=1) & (free_above_m >= low_m)
+
+    def seen(range_m: float) -> Int64[ndarray, "h w"]:
+        column, row = (free[inside & (free_above_m < low_m + range_m)][:, :2] - first[:2]).T
+        return np.bincount(row * width + column, minlength=height * width).reshape(height, width)
+
+    seen_m = min(high_m - low_m, _SEEN_M)
+    is_low_seen, is_seen = seen(_LOWEST_M) > 0, seen(seen_m) >= _SEEN_SHARE * seen_m / settings.voxel_m
+    column, row = (voxels[above_m < low_m][:, :2] - first[:2]).T
+    is_low_seen[row, column] = True
+    cells = np.where(is_low_seen & (is_seen | (len(free) == 0)), FREE, UNKNOWN).astype(np.int8)
+    obstacles = voxels[(above_m >= low_m) & (above_m <= high_m)] - (*first[:2], floor)
+    cells[_without_specks(obstacles, (height, width))] = OCCUPIED
+    T = np.eye(4) if T_upright_map is None else T_upright_map
+    return FloorGrid(cells, first[:2] * settings.voxel_m, settings.voxel_m, (floor + 1) * settings.voxel_m, T)
+
+
+def _without_specks(obstacles: Int64[ndarray, "v 3"], shape: tuple[int, int]) -> Bool[ndarray, "h w"]:
+    """Return the cells with an obstacle, without small ones of one low voxel a cell: errors of the floor's depth."""
+    counts, has_higher = np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
+    column, row, layer = obstacles.T
+    counts[row, column] = 1
+    higher = layer > layer.min(initial=np.iinfo(np.int64).max)
+    has_higher[row[higher], column[higher]] = True
+    _, labels, figures, _ = cv2.connectedComponentsWithStats(counts, connectivity=8)
+    is_obstacle = figures[:, cv2.CC_STAT_AREA] >= _SPECK_CELLS
+    is_obstacle[labels[has_higher]] = True
+    is_obstacle[0] = False
+    return np.asarray(is_obstacle[labels])
 
 
 def floor_layer(voxels: Int64[ndarray, "v 3"]) -> int:

@@ -12,9 +12,9 @@ from numpy import ndarray
 from gausslite.domain.errors import MismatchError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import transform_points
-from gausslite_export.occupancy import FREE, OCCUPIED
+from gausslite_export.occupancy import FREE, FloorGrid
 from gausslite_mcp.object_views import ObjectSight
-from gausslite_mcp.place import FloorGrid, Scene
+from gausslite_mcp.place import Scene
 
 _SECTORS = 24
 _MIN_VISIBLE = 0.2
@@ -82,10 +82,7 @@ def goal_near(
 
 def _reachable(grid: FloorGrid, radius_m: float, start_m: Float64[ndarray, "3"] | None) -> Bool[ndarray, "h w"]:
     """Return the free cells where the robot fits that are connected with its own, or the largest such area."""
-    side = 2 * int(np.ceil(radius_m / grid.cell_m)) + 1
-    body = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    blocked = cv2.dilate((grid.cells == OCCUPIED).astype(np.uint8), body) > 0
-    fits: Bool[ndarray, "h w"] = (grid.cells == FREE) & ~blocked
+    fits: Bool[ndarray, "h w"] = (grid.cells == FREE) & (grid.distance_m > radius_m)
     _, labels, figures, _ = cv2.connectedComponentsWithStats(fits.astype(np.uint8), connectivity=4)
     if not fits.any():
         return fits

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from threading import RLock
 from typing import Final, Protocol, TypeVar
 
 import numpy as np
-from jaxtyping import Float64, Int8
+from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import StoredMap, gaussians_from_ply
@@ -19,56 +19,42 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import move_gaussians
 from gausslite.domain.objects import TeamObject
-from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose import UpAxis, inverse
+from gausslite.mapping.free_space import DepthView
 from gausslite.render.rasterizer import Rendering
 from gausslite.wire.channel import require_callable
 from gausslite.wire.clients import Export, FusionClient
 from gausslite.wire.convert import camera_from_message, transform_from_message
 from gausslite.wire.security import Tls
 from gausslite_export.formats import upright_motion
-from gausslite_export.free_cells import free_voxels
-from gausslite_export.occupancy import (
-    NO_VOXELS,
-    OccupancySettings,
-    floor_layer,
-    planar_grid,
-    require_voxels,
-)
+from gausslite_export.occupancy import NO_VOXELS, FloorGrid, OccupancySettings, planar_grid, require_voxels
+from gausslite_export.surface_votes import count_votes, rendered_depths
 from gausslite_objects.areas import read_areas
 from gausslite_objects.edits import read_edits
 from gausslite_objects.mapped_objects import MappedObjects, open_memory, query, read_folder
 from gausslite_objects.object_memory import ObjectMemory
+from gausslite_objects.visit import depth_views, read_depths
 from gausslite_render.splat_map import read_splats
 from gausslite_render.viewer import SplatViewer
 
 _Value = TypeVar("_Value")
 _MAX_VIEWS: Final = 48
-_FREE_VIEWS: Final = 16
-"""Keyframes that a place uses, for views and for free space, evenly in their order: more take longer."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FloorGrid:
-    """Cells in x and y of the upright map: the values of `gausslite_export.occupancy`, and where they lie.
-
-    origin_m: lower corner of the first cell. floor_m: height of the floor. T_upright_map: turns the map upright.
-    """
-
-    cells: Int8[ndarray, "h w"]
-    origin_m: Float64[ndarray, "2"]
-    cell_m: float
-    floor_m: float
-    T_upright_map: Float64[ndarray, "4 4"]
+_RENDERED_VIEWS: Final = 16
+"""Keyframes that a place uses, and renders for its grid if their depth is not kept, evenly in their order."""
 
 
 @dataclass(eq=False)
 class Scene:
-    """A map to look at, with the views that its keyframes saw, oldest first. Its methods are thread-safe."""
+    """A map to look at, with the views that its keyframes saw, oldest first. Its methods are thread-safe.
+
+    depths: the depth that keyframes measured, where it is kept.
+    """
 
     splats: StoredMap
     views: Sequence[KeyframeView]
     up_axis: UpAxis
     threads: int | None = None
+    depths: Sequence[DepthView] = ()
     _lock: RLock = field(default_factory=RLock, repr=False)
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Rendering:
@@ -91,21 +77,16 @@ class Scene:
     @cached_property
     def _floor(self) -> FloorGrid:
         T, settings = upright_motion(np.array(self.up_axis)), OccupancySettings()
-        gaussians = move_gaussians(self.splats.gaussians, T)
-        occupied, free = require_voxels(gaussians, settings), NO_VOXELS
-        if self.views:
-
-            def render(camera: Camera, T_upright_camera: Float64[ndarray, "4 4"]) -> Rendering:
-                return self.render(camera, T.T @ T_upright_camera)
-
-            views = [
-                KeyframeView(v.index, v.capture_time_ns, v.camera, T @ v.T_world_camera, v.roi_pixels)
-                for v in evenly(self.views, _FREE_VIEWS)
-            ]
-            free = free_voxels(views, render, occupied, occupied, settings.voxel_m)
-        cells, first = planar_grid(occupied, free, settings)
-        floor_m = (floor_layer(occupied) + 1) * settings.voxel_m
-        return FloorGrid(cells, first * settings.voxel_m, settings.voxel_m, floor_m, T)
+        if not self.views:
+            gaussians = move_gaussians(self.splats.gaussians, T)
+            return planar_grid(require_voxels(gaussians, settings), NO_VOXELS, settings, T)
+        seen = self.depths or rendered_depths(evenly(self.views, _RENDERED_VIEWS), self.render)
+        turned = (replace(view, T_camera_world=view.T_camera_world @ inverse(T)) for view in seen)
+        votes = count_votes(turned, settings.voxel_m)
+        surface = votes.surface()
+        if not len(surface):
+            raise InvalidInputError(f"map: expected surfaces that the {len(self.views)} keyframes show, got none")
+        return planar_grid(surface, votes.free(), settings, T)
 
 
 class Place(Protocol):
@@ -136,8 +117,9 @@ class RunPlace:
         """Raises InvalidInputError, MapFileError, CodecError."""
         self.name, self._folder = str(folder), folder
         self._said, self._objects = self._read_said(), read_folder(folder)
-        views = evenly(read_keyframe_views(folder), _MAX_VIEWS)
-        self._scene = Scene(read_splats(folder), views, self._objects.up_axis, threads)
+        views = read_keyframe_views(folder)
+        depths, _ = depth_views(views, read_depths(folder, views))
+        self._scene = Scene(read_splats(folder), evenly(views, _MAX_VIEWS), self._objects.up_axis, threads, depths)
 
     def objects(self) -> MappedObjects:
         """Return the objects of report.json after edits."""

@@ -154,6 +154,15 @@ def _add_questions(server: MCPServer[Any], tools: PlaceTools) -> None:
         """
         return _as_json(tools.goal_near, object, distance_m, robot_radius_m, from_m)
 
+    @server.tool(annotations=_READS, structured_output=False)
+    def clearance(points_m: Annotated[list[_Point], Field(description="points such as those of a path")]) -> str:
+        """Return how far each point is from the nearest obstacle 0.1 to 1.8 m above the floor, and what its cell is.
+
+        distances_m are in metres along the floor, negative inside of obstacles, null beyond the map; cells are free,
+        occupied or unknown. A robot fits where a cell is free and its distance exceeds the robot's radius.
+        """
+        return _as_json(tools.clearance, points_m)
+
 
 def _add_views(server: MCPServer[Any], tools: PlaceTools) -> None:
     @server.tool(annotations=_READS, structured_output=False)

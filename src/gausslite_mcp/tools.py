@@ -18,6 +18,7 @@ from gausslite.domain.checks import require_instance
 from gausslite.domain.errors import InvalidInputError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.security import Tls
+from gausslite_export.occupancy import FREE, OCCUPIED, UNKNOWN
 from gausslite_mcp.context import relations_of
 from gausslite_mcp.goals import GoalSettings, goal_near
 from gausslite_mcp.object_views import VIEW_CAMERA, best_view, look_at
@@ -28,6 +29,8 @@ from gausslite_objects.mapped_objects import as_json, select
 _JPEG_QUALITY = 90
 _FOV_DEG = (20.0, 120.0)
 _DIGITS = 4
+_MAX_POINTS = 1000
+_CELLS = {UNKNOWN: "unknown", FREE: "free", OCCUPIED: "occupied"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +95,20 @@ class PlaceTools:
         figures = {"distance_m": goal.distance_m, "visible": goal.visible}
         return _rounded({**values, **figures, "T_world_camera": goal.T_world_camera.tolist()})
 
+    def clearance(self, points_m: Sequence[Sequence[float]]) -> dict[str, Any]:
+        """Return at each point the distance to the nearest obstacle along the floor, and what its cell is."""
+        if not 0 < len(points_m) <= _MAX_POINTS:
+            raise InvalidInputError(f"points_m: expected 1 to {_MAX_POINTS} points, got {len(points_m)}")
+        grid = self.place.scene().floor()
+        cells = [grid.cell_at(np.array(_point("points_m", point))) for point in points_m]
+        distances_m = grid.distance_m
+        return _rounded(
+            {
+                "cells": ["unknown" if cell is None else _CELLS[int(grid.cells[cell])] for cell in cells],
+                "distances_m": [None if cell is None else _finite(distances_m[cell]) for cell in cells],
+            }
+        )
+
     def best_view(self, name: str) -> tuple[dict[str, Any], bytes]:
         """Return the view that shows an object best, and its image."""
         landmark, scene = find_object(self.place.objects(), name).landmark, self.place.scene()
@@ -131,6 +148,10 @@ def _image(scene: Scene, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
     rgb: Float32[ndarray, "h w 3"] = scene.render(camera, T_world_camera).rgb
     pixels = cv2.cvtColor(np.rint(rgb * 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
     return bytes(cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))[1])
+
+
+def _finite(distance_m: float) -> float | None:
+    return float(distance_m) if math.isfinite(distance_m) else None
 
 
 def _within(name: str, value: float, low: float, high: float) -> float:

@@ -14,9 +14,9 @@ from numpy import ndarray
 from gausslite.datasets.pose_track import quat_xyzw
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite_export.occupancy import FloorGrid
 from gausslite_link.agent_link import AgentSnapshot, SentFrames
 from gausslite_ros.live_frames import LiveCounters
-from gausslite_ros.live_map import Grid
 
 Fields = dict[str, Any]
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
@@ -167,17 +167,17 @@ def point_cloud(gaussians: Gaussians, frame: str, stamp_ns: int) -> Fields:
     }
 
 
-def occupancy_grid(grid: Grid, cell_m: float, frame: str, stamp_ns: int) -> Fields:
+def occupancy_grid(grid: FloorGrid, frame: str, stamp_ns: int) -> Fields:
     """Return a nav_msgs/OccupancyGrid."""
     stamped = header(frame, stamp_ns)
     return {
         "header": stamped,
         "info": {
             "map_load_time": stamped["stamp"],
-            "resolution": float(cell_m),
+            "resolution": float(grid.cell_m),
             "width": grid.cells.shape[1],
             "height": grid.cells.shape[0],
-            "origin": _pose([*grid.origin_m, 0.0]),
+            "origin": _pose([*grid.origin_m.tolist(), 0.0]),
         },
         "data": array("b", np.ascontiguousarray(grid.cells).tobytes()),
     }

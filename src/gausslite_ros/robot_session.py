@@ -327,7 +327,7 @@ class RobotSession:
         if contents is None:
             return []
         grids = [
-            Outgoing(_grid_topic(number), occupancy_grid(grid, self._parameters.cell_m, frame, stamp_ns))
+            Outgoing(_grid_topic(number), occupancy_grid(grid, frame, stamp_ns))
             for number, grid in enumerate(contents.grids)
         ]
         clouds = ((REGION, contents.region), (SPLATS, contents.gaussians))

@@ -32,7 +32,7 @@ def test_map_writes_the_cameras_of_its_keyframes(results):
 
 
 OPTIONS = {
-    **dict.fromkeys(("octomap", "nav2", "mesh"), ("--voxel", "0.1")),
+    **dict.fromkeys(("octomap", "nav2", "esdf", "mesh"), ("--voxel", "0.1")),
     "video": ("--seconds", "0.2"),
 }
 
@@ -159,8 +159,8 @@ def test_the_objects_of_a_damaged_report_are_not_exported_as_none(results, tmp_p
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        (("--voxel", "0.1"), "--voxel: expected with --to mesh or nav2 or octomap, got --to spz"),
-        (("--min-opacity", "0.1"), "--min-opacity: expected with --to nav2 or octomap, got --to spz"),
+        (("--voxel", "0.1"), "--voxel: expected with --to esdf or mesh or nav2 or octomap, got --to spz"),
+        (("--min-opacity", "0.1"), "--min-opacity: expected with --to esdf or nav2 or octomap, got --to spz"),
         (("--seconds", "3"), "--seconds: expected with --to video, got --to spz"),
         (("--to", "sog", "--spz-version", "4"), "--spz-version: expected with --to spz, got --to sog"),
     ],

@@ -12,9 +12,13 @@ import yaml
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import inverse, transform_of, transform_points
+from gausslite.mapping.free_space import DepthView
 from gausslite.plugins import Group, load
+from gausslite.render.map_viewer import view_map
 from gausslite_export.format import ExportSettings, Format, MapContent
-from gausslite_export.occupancy import OccupancySettings, occupied_voxels
+from gausslite_export.occupancy import FREE, OCCUPIED, OccupancySettings, occupied_voxels
+from gausslite_export.surface_votes import count_votes
 
 VOXEL_M, HALF_M, WALL_M, EYE_M = 0.1, 2.0, 1.5, 0.75
 SETTINGS = OccupancySettings(voxel_m=VOXEL_M)
@@ -65,20 +69,47 @@ def test_a_rooms_inside_is_free_its_walls_are_occupied_and_behind_them_is_unknow
     gaussians = room()
     cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=VIEWS)))
     at = lambda x, y: cells[int((x - origin[0]) / VOXEL_M), int((y - origin[1]) / VOXEL_M)]  # noqa: E731
-    assert all(at(x, y) == 254 for x in (-1.45, 0.05, 1.45) for y in (-1.45, 0.05, 1.45))
-    assert all(at(*p) == 0 for p in ((2.03, 0.05), (-1.97, 0.05), (0.05, 2.03), (0.05, -1.97), (3.53, 0.03)))
-    assert all(at(x, y) == 205 for x in (2.45, 2.95) for y in (-1.45, 0.05, 1.45))
+    assert all(at(x, y) == 254 for x in (-1.45, 1.15, 1.45) for y in (-1.45, 1.15, 1.45))
+    assert all(at(*p) == 0 for p in ((2.03, 0.05), (-1.97, 0.05), (0.05, 2.03), (0.05, -1.97)))
+    assert at(0.05, 0.05) == 205  # no camera sees the floor below it
+    assert cells.shape[0] <= 42  # nor the post behind the wall
 
 
-@pytest.mark.slow
-def test_free_cells_change_neither_size_nor_origin_nor_obstacles_and_need_keyframes(tmp_path):
+def test_needles_of_gaussians_are_no_obstacles_and_measured_depth_comes_before_that_of_the_map(tmp_path):
+    walls = room()
+    scales_m = walls.scales_m.copy()
+    scales_m[::40] = 0.5, 0.01, 0.01  # through the walls, and along them
+    needles = dataclasses.replace(walls, scales_m=scales_m)
+    render = view_map(walls).render
+    depths_m = {view.index: render(CAMERA, view.T_world_camera).expected_depth_m() for view in VIEWS}
+    content = MapContent(needles, needles, views=VIEWS, depths_m=depths_m)
+    cells, origin = grid(export(tmp_path, "nav2", content))
+    plain, plain_origin = grid(export(tmp_path, "nav2", MapContent(walls, walls, views=VIEWS)))
+    assert origin == plain_origin
+    assert (cells == plain).all()
+
+
+def test_distances_to_obstacles_have_the_pose_of_their_grid(tmp_path):
     gaussians = room()
-    bare, bare_origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians)))
-    cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=VIEWS)))
-    assert cells.shape == bare.shape
-    assert origin == bare_origin
-    assert ((cells == 0) == (bare == 0)).all()
-    assert (bare[15:25, 15:25] == 205).all()
+    T_map_upright = transform_of(np.array([1.0, 2.0, 3.0, 0.0, np.pi / 2, 0.0]))
+    content = MapContent(gaussians, gaussians, views=VIEWS, T_upright_map=inverse(T_map_upright))
+    found = np.load(export(tmp_path, "esdf", content))
+    row, column = (int((1.25 - low) / VOXEL_M) for low in found["origin_m"])
+    assert found["cells"][row, column] == FREE
+    assert found["distance_m"][row, column] == pytest.approx(0.8, abs=0.11)
+    assert found["distance_m"][found["cells"] == OCCUPIED].max() == 0
+    in_map_m = transform_points(found["T_map_grid"], np.array([1.25, 1.25, 0.0]))
+    np.testing.assert_allclose(transform_points(inverse(T_map_upright), in_map_m), (1.25, 1.25, 0.0), atol=0.11)
+
+
+def test_a_thin_surface_stays_where_most_images_see_past_it_and_one_error_is_none():
+    far = np.full((120, 160), 3.0, np.float32)
+    near = far.copy()
+    near[50:70, 79:81] = 1.0
+    votes = count_votes([DepthView.of(image, CAMERA, np.eye(4)) for image in (near, near, far, far, far)], VOXEL_M)
+    assert (votes.surface()[:, 2] == 10).any()
+    once = count_votes([DepthView.of(image, CAMERA, np.eye(4)) for image in (near, far, far)], VOXEL_M)
+    assert not (once.surface()[:, 2] == 10).any()
 
 
 def test_octomap_has_free_voxels_and_none_of_them_holds_an_opaque_gaussian(tmp_path):

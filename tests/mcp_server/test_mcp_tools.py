@@ -61,7 +61,7 @@ def values(result: Any) -> dict[str, Any]:
 
 def test_a_model_lists_objects_asks_and_looks(folder: Path) -> None:
     server = build_server(PlaceTools(open_place(str(folder), threads=1)))
-    listed, asked, context, best, view, goal = answers(
+    listed, asked, context, best, view, goal, clearance = answers(
         server,
         ("list_objects", {}),
         ("list_objects", {"question": "what is on the table"}),
@@ -69,6 +69,7 @@ def test_a_model_lists_objects_asks_and_looks(folder: Path) -> None:
         ("best_view", {"object": "cube-1"}),
         ("render_view", {"position_m": [1, -1.5, 1], "look_at_m": [1, 0, 0.6], "fov_deg": 40}),
         ("goal_near", {"object": "cube", "distance_m": 0.6, "robot_radius_m": 0.1}),
+        ("clearance", {"points_m": [[0.3, -0.3, 0.0], [1.0, 0.3, 0.0], [-2.5, -1.9, 0.0], [50, 0, 0]]}),
     )
     assert [found["id"] for found in values(listed)["objects"]] == ["cube-1", "lamp-3", "table-2"]
     assert [found["id"] for found in values(asked)["objects"]] == ["cube-1"]
@@ -82,6 +83,9 @@ def test_a_model_lists_objects_asks_and_looks(folder: Path) -> None:
         assert red > 2 * max(blue, green)
     assert values(goal)["object"] == "cube-1"
     assert values(goal)["visible"] > 0.5
+    assert values(clearance)["cells"] == ["free", "occupied", "unknown", "unknown"]
+    assert values(clearance)["distances_m"][0] == pytest.approx(0.35, abs=0.1)
+    assert (values(clearance)["distances_m"][1] <= 0, values(clearance)["distances_m"][3]) == (True, None)
 
 
 def test_errors_are_those_of_the_library(folder: Path) -> None:
@@ -91,6 +95,7 @@ def test_errors_are_those_of_the_library(folder: Path) -> None:
         ("list_objects", {"question": "the the"}, "QUESTION: "),
         ("render_view", {"position_m": [1, 1, 1], "look_at_m": [1, 1, 1]}, "away from what it looks at"),
         ("render_view", {"position_m": [1, 1], "look_at_m": [1, 1, 1]}, "at least 3 items"),
+        ("clearance", {"points_m": []}, "points_m: expected 1 to 1000 points, got 0"),
         ("goal_near", {"object": "cube", "distance_m": 99}, "distance_m: expected 0 to 5, got 99"),
         ("goal_near", {"object": "cube", "from_m": [1e9, 0, 0]}, "from_m: expected three numbers in metres"),
         ("assign_task", {"task": "Find the mug"}, "expected a server that was started with --agent HOST:PORT"),

@@ -15,7 +15,7 @@ from gausslite_mcp.goals import GoalSettings, goal_near
 from gausslite_mcp.object_views import ObjectSight, best_view, look_at
 from gausslite_mcp.place import RunPlace, find_object
 
-BEHIND_THE_WALL, BESIDE, ABOVE = (-1.5, -1.0, 0.7), (1.0, -1.6, 1.0), (2.2, 0.8, 1.6)
+BEHIND_THE_WALL, BESIDE, ABOVE, TO_THE_GAP = (-1.5, -1.0, 0.7), (1.0, -1.6, 1.0), (2.2, 0.8, 1.6), (-2.8, 1.6, 1.0)
 SMALL = GoalSettings(radius_m=0.1, distance_m=0.6)
 
 
@@ -74,12 +74,12 @@ def test_a_goal_is_free_reachable_near_and_sees_the_object(tmp_path: Path) -> No
 
 
 def test_a_goal_behind_a_wall_or_for_a_robot_too_wide_is_no_goal(tmp_path: Path) -> None:
-    place = room(tmp_path, BESIDE, ABOVE)
+    place = room(tmp_path, BESIDE, ABOVE, TO_THE_GAP, TO_THE_GAP)
     cube = find_object(place.objects(), "cube").landmark
-    around = goal_near(place.scene(), cube, SMALL, from_m=(-2.5, -1.0, 0.0))  # through the gap
+    around = goal_near(place.scene(), cube, SMALL, from_m=(-1.5, 1.0, 0.0))  # through the gap
     assert around.position_m[0] > 0
     for settings, from_m in (
-        (GoalSettings(radius_m=0.9), (-2.5, -1.0, 0.0)),  # the floor of the gap is 0.8 m wide
+        (GoalSettings(radius_m=0.9), (-1.5, 1.0, 0.0)),  # the floor of the gap is 0.8 m wide
         (SMALL, (9.0, 9.0, 0.0)),
     ):
         with pytest.raises(MismatchError, match="expected a free place within 2 m that can be reached and sees it"):

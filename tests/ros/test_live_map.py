@@ -8,9 +8,9 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite_export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancySettings
+from gausslite_export.occupancy import FREE, OCCUPIED, UNKNOWN, FloorGrid, OccupancySettings
 from gausslite_link.map_follower import FollowedMap
-from gausslite_ros.live_map import Grid, LiveMap
+from gausslite_ros.live_map import LiveMap
 
 CELL_M = 0.1
 CAMERA = Camera.centred(80.0, 160, 120)
@@ -26,10 +26,11 @@ def forward_frame(depth_m: float) -> Frame:
     T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     T[:3, 3] = 0.05, 0.05, 0.55
     depths_m = np.full((120, 160), depth_m, np.float32)
+    depths_m[77:] = 0.0  # below the floor
     return Frame(0, 0, np.zeros((120, 160, 3), np.uint8), depths_m, CAMERA, T)
 
 
-def at(grid: Grid, x_m: float, y_m: float) -> int:
+def at(grid: FloorGrid, x_m: float, y_m: float) -> int:
     column, row = (
         int(np.floor((value - low) / CELL_M + 1e-6)) for value, low in zip((x_m, y_m), grid.origin_m, strict=True)
     )
@@ -51,6 +52,10 @@ def test_what_a_frame_sees_through_is_free_and_what_it_does_not_is_unknown() -> 
     assert contents is not None
     grid = contents.grids[0]
     assert [at(grid, x_m, 0.05) for x_m in (2.05, 2.35, 3.05, 3.55)] == [OCCUPIED, FREE, UNKNOWN, OCCUPIED]
+    live.see(forward_frame(2.6), np.eye(4))
+    contents = live.update()
+    assert contents is not None
+    assert at(contents.grids[0], 2.05, 0.05) == FREE  # two images see through what the map still has
 
 
 def test_a_correction_of_the_odometry_moves_the_free_cells() -> None:

@@ -10,9 +10,9 @@ import pytest
 from sample_gaussians import plain_gaussians
 from test_robot_session import MUG, NOW_NS, PUBLICATIONS, SNAPSHOT
 
+from gausslite_export.occupancy import FloorGrid
 from gausslite_link.agent_link import SentFrames
 from gausslite_ros.live_frames import LiveCounters
-from gausslite_ros.live_map import Grid
 from gausslite_ros.messages import CompressedImageMessage, stamp_ns
 from gausslite_ros.outgoing import correction_transform, diagnostics, object_markers, occupancy_grid, point_cloud
 from gausslite_ros.robot_session import DIAGNOSTICS, OBJECTS, OCCUPANCY, REGION, SPLATS, TF
@@ -25,7 +25,9 @@ FIELDS = {
     OBJECTS: object_markers((MUG,), "map", NOW_NS),
     REGION: point_cloud(plain_gaussians([[1.0, 2.0, 3.0]]), "map", NOW_NS),
     SPLATS: point_cloud(plain_gaussians([[1.0, 2.0, 3.0]]), "map", NOW_NS),
-    OCCUPANCY: occupancy_grid(Grid(np.array([[-1, 0, 100]], np.int8), (0.5, 1.5)), 0.05, "map", NOW_NS),
+    OCCUPANCY: occupancy_grid(
+        FloorGrid(np.array([[-1, 0, 100]], np.int8), np.array([0.5, 1.5]), 0.05, 0.0, np.eye(4)), "map", NOW_NS
+    ),
     DIAGNOSTICS: diagnostics(SNAPSHOT, (LiveCounters(), SentFrames()), ("a problem",), NOW_NS, "agent"),
 }
 
