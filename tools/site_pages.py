@@ -19,7 +19,7 @@ from latex2mathml.converter import convert as mathml
 from mkdocs.structure.files import File, Files
 
 from gausslite.cli.main import build_parser
-from gausslite.config.program import PROGRAM, Program, describe, variable_name
+from gausslite.config.program import PROGRAM, Program, option_help, variable_name
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -143,7 +143,7 @@ def _option_tables() -> str:
     for parser in parsers:
         program: Program = parser.get_default(PROGRAM)
         rows = [
-            f"| `{program.name(key)}` | `{variable_name(key)}` | {_table_cell(describe(declared))} |"
+            f"| `{program.name(key)}` | `{variable_name(key)}` | {_table_cell(option_help(declared))} |"
             for key, declared in program.options.items()
         ]
         head = (f"## All settings of {parser.prog}\n", "| option | variable | meaning |", "|---|---|---|")

@@ -76,9 +76,11 @@ class Edit:
                 f"got {quote_name(self.value)}"
             )
 
-    def concerns(self, landmark: ObjectLandmark) -> bool:
-        """Return True if an object is the edited one: the same noun, in its place."""
-        return self.target is not None and _is_same(self.target, landmark)
+    def concerned(self, landmarks: Sequence[ObjectLandmark]) -> list[ObjectLandmark]:
+        """Return which objects are the edited one: that of its id, or all; in its place, of its noun."""
+        assert self.target is not None
+        found = [landmark for landmark in landmarks if _is_same(self.target, landmark)]
+        return [landmark for landmark in found if landmark.object_id == self.target.object_id] or found
 
     def halves(self, landmark: ObjectLandmark) -> list[ObjectLandmark]:
         """Return the parts of an object on both sides of the cut; the object if the cut does not go through it."""
@@ -129,7 +131,7 @@ def apply_edits(objects: Iterable[ObjectLandmark], edits: Sequence[Edit]) -> Edi
     parts: dict[str, tuple[str, ...]] = {landmark.object_id: (landmark.object_id,) for landmark in left}
     for edit in effective(edits):
         assert edit.target is not None
-        found = [landmark for landmark in left if edit.concerns(landmark)]
+        found = edit.concerned(left)
         if edit.kind is EditKind.DELETE:
             left = [landmark for landmark in left if landmark not in found]
         elif edit.kind is EditKind.RENAME:

@@ -44,6 +44,12 @@ def test_an_edit_wins_over_later_detections_until_it_is_undone(run: Path) -> Non
     assert _edited(run, again).objects == ()
 
 
+def test_of_two_objects_in_one_place_the_one_of_the_id_is_edited(run: Path) -> None:
+    beside = replace(FOUND, object_id="mug-9", centroid_m=tuple(value + 0.01 for value in FOUND.centroid_m))
+    _edit(run, "delete", FOUND.object_id)
+    assert _edited(run, FOUND, beside).objects == (beside,)
+
+
 def test_a_renamed_object_has_its_new_name_for_later_edits(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _edit(run, "rename", FOUND.object_id, "cup")
     _edit(run, "note", FOUND.object_id, "the blue one")

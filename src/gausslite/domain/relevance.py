@@ -207,8 +207,8 @@ class DetectedImage:
             frame.index,
             frame.rgb,
             tuple(
-                DetectedBox(each.phrase, each.score, each.box_px, each.rival, each.is_weak, each.class_name)
-                for each in detections
+                DetectedBox(found.phrase, found.score, found.box_px, found.rival, found.is_weak, found.class_name)
+                for found in detections
             ),
         )
 

@@ -189,7 +189,7 @@ class PerceptionSettings:
 
     model: Path | None = option(
         None,
-        "a YOLO, YOLO-World or Grounding DINO model (default: the source's ground truth)",
+        "an RF-DETR, YOLO, YOLO-World or Grounding DINO model (default: the source's ground truth)",
         key="detector",
         metavar="FILE.onnx",
         metadata=FILE,

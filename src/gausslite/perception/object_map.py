@@ -358,13 +358,17 @@ def describe_landmarks(landmarks: Sequence[tuple[Landmark, ObjectRole]]) -> tupl
 
 
 def _describe(landmark: Landmark, role: ObjectRole) -> ObjectLandmark:
-    x, y, z = (float(value) for value in landmark.centroid_m)
+    box = landmark.box_m()
+    low_m, high_m = np.array(box.min_m), np.array(box.max_m)
+    # the mean of the cells can lie behind the object, where masks also show what is there
+    is_inside = (landmark.centroid_m >= low_m) & (landmark.centroid_m <= high_m)
+    x, y, z = np.where(is_inside, landmark.centroid_m, 0.5 * (low_m + high_m)).tolist()
     return ObjectLandmark(
         object_id=f"{landmark.phrase}-{landmark.number}",
         noun=landmark.phrase,
         role=role,
         centroid_m=(x, y, z),
-        extent_m=landmark.box_m(),
+        extent_m=box,
         confidence=landmark.confidence,
         first_seen_ns=landmark.first_seen_ns,
         last_seen_ns=landmark.last_seen_ns,

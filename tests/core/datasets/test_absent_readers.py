@@ -61,7 +61,7 @@ def test_an_unknown_address_names_what_is_installed_and_what_is_not(
     remove_package(monkeypatch, "gausslite_ros")
     (tmp_path / "run.mcap").touch()
     with pytest.raises(
-        DatasetError, match=r"an .r3d file or sim:home; got a file; bag: needs the package gausslite_ros"
+        DatasetError, match=r"an .r3d file or sim:home; got an empty file; bag: needs the package gausslite_ros"
     ):
         open_source(str(tmp_path / "run.mcap"))
 

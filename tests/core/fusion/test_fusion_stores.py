@@ -273,7 +273,7 @@ CHILD = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from support.sample_batches import random_subset
+from sample_batches import random_subset
 from gausslite.fusion.sqlite_store import SqliteStore
 store = SqliteStore(Path(sys.argv[1]))
 for revision in range(1, 1_000_000):
@@ -284,7 +284,7 @@ for revision in range(1, 1_000_000):
 
 def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
-    folder = Path(__file__).parents[2]
+    folder = Path(__file__).parents[2] / "support"
     child = subprocess.Popen([sys.executable, "-c", CHILD, path, folder], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None
     acknowledged = 0
