@@ -108,7 +108,7 @@ class Acknowledgements:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCounters:
-    """Messages of one agent. last_seen_ns: time of its latest subset, 0 before the first."""
+    """Messages of one agent. last_seen_ns: time of its latest subset or sign of life, 0 before."""
 
     last_seen_ns: int = 0
     roi_bytes: int = 0
@@ -132,9 +132,8 @@ class TrafficLog:
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
-        newer = replace(traffic, last_seen_ns=time.time_ns())
         with self._lock:
-            self._by_agent[agent_id] = self.of(agent_id).plus(newer)
+            self._by_agent[agent_id] = self.of(agent_id).plus(replace(traffic, last_seen_ns=time.time_ns()))
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""
