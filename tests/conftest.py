@@ -60,3 +60,21 @@ def postgres() -> Iterator[PostgresServer]:
     """Return a running PostgreSQL server; skip the test where it is not installed."""
     with postgres_server() as server:
         yield server
+
+
+@pytest.fixture
+def fusion() -> Iterator[object]:
+    """Return a fusion server in this process with its clients, a `fusion_running.RunningServer`."""
+    from fusion_running import fusion_server
+
+    with fusion_server() as running:
+        yield running
+
+
+@pytest.fixture
+def robot() -> Iterator[object]:
+    """Return an agent and its service in this process, an `agent_running.Agent`."""
+    from agent_running import agent
+
+    with agent() as running:
+        yield running

@@ -22,6 +22,17 @@ from gausslite.domain.errors import MissingPluginError
 TASK_NOT_FOUND: Final = 3
 # exit code of a mission that does not know the robot's place at its end
 ROBOT_LOST: Final = 4
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_IMPATIENCE_S = 1.0
+"""Launchers repeat a signal within this, or follow with another one: only a later same one is a user's."""
+_OF_LIBRARIES = {"OPENBLAS_NUM_THREADS": "1", "GRPC_VERBOSITY": "NONE"}
+"""Variables that NumPy and gRPC read when they are loaded, unless the user sets them.
+
+Products of many points and a small matrix would only wait for further threads. Errors of connections are exceptions,
+which the programs report; gRPC would log them once more.
+"""
+_SWITCHES = {"ORT_DISABLE_TELEMETRY": "1"}
+"""Variables that ONNX Runtime reads when it is loaded, also as a part of onnxruntime-genai."""
 
 
 def installed_version() -> str:
@@ -50,11 +61,6 @@ def print_message(text: str) -> None:
         print(printable(text), file=sys.stderr)
 
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_IMPATIENCE_S = 1.0
-"""Launchers repeat a signal within this, or follow with another one: only a later same one is a user's."""
-
-
 def handled_signals() -> tuple[signal.Signals, ...]:
     """Return the signals that end a program; not those that its caller ignores, as `nohup` does with SIGHUP."""
     return tuple(number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN)
@@ -69,14 +75,6 @@ class _QuietEnd:
     def __call__(self, number: int, _frame: FrameType | None) -> None:
         os.write(2, f"{self._program}: interrupted while starting\n".encode())
         os._exit(128 + number)
-
-
-_OF_LIBRARIES = {"OPENBLAS_NUM_THREADS": "1", "GRPC_VERBOSITY": "NONE"}
-"""Variables that NumPy and gRPC read when they are loaded, unless the user sets them.
-
-Products of many points and a small matrix would only wait for further threads. Errors of connections are exceptions,
-which the programs report; gRPC would log them once more.
-"""
 
 
 def end_quietly_while_starting(program: str) -> None:
@@ -178,10 +176,6 @@ class DeferredInterrupt:
             self.pending_exception = KeyboardInterrupt() if number == signal.SIGINT else Terminated()
         elif number == self._first and time.monotonic() - self._since_s > _IMPATIENCE_S:
             raise self.pending_exception
-
-
-_SWITCHES = {"ORT_DISABLE_TELEMETRY": "1"}
-"""Variables that ONNX Runtime reads when it is loaded, also as a part of onnxruntime-genai."""
 
 
 def disable_telemetry() -> None:

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +31,7 @@ from gausslite.domain.relevance import Region
 from gausslite.mission.recording import calibrate_with_messages, open_recorded, report_region_file, stated_values
 from gausslite.mission.results import MAP, REPORT_PAGE, require_absent
 from gausslite.mission.runner import FrameStream
-from gausslite.mission.settings import SceneInfo
+from gausslite.nouns import meant_by
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
 STORE = "fusion.sqlite"
@@ -160,7 +160,7 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
     if options.objects:
         return dict(zip(options.objects, choose_regions(regions, options.objects), strict=True))
     targets = {t for task in (options.task_a, options.task_b) for t in DefaultParser().parse(task).targets}
-    chosen = SceneInfo(regions=regions).regions_of(targets)
+    chosen = _regions_of(regions, targets)
     if not chosen:
         raise InvalidInputError(
             f"demo: expected ground-truth regions of {', '.join(sorted(targets))} to score, "
@@ -169,10 +169,15 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
     return chosen
 
 
+def _regions_of(regions: Mapping[str, Region], targets: Iterable[str]) -> dict[str, Region]:
+    """Return the regions of the objects that these nouns of a task mean."""
+    meant = {name for target in targets for name in meant_by(target, regions)}
+    return {name: roi for name, roi in regions.items() if name in meant}
+
+
 def _task_regions(agents: Sequence[AgentPlan], regions: Mapping[str, Region]) -> dict[str, Sequence[Region]]:
     """Return the scored regions of each agent's task; none of them if one has none, as figures would be missing."""
-    scene = SceneInfo(regions=regions)
-    found = {agent.agent_id: scene.regions_of(set(DefaultParser().parse(agent.task).targets)) for agent in agents}
+    found = {agent.agent_id: _regions_of(regions, DefaultParser().parse(agent.task).targets) for agent in agents}
     return {name: list(own.values()) for name, own in found.items()} if all(found.values()) else {}
 
 

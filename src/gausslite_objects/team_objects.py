@@ -31,6 +31,7 @@ from gausslite.domain.objects import (
     ObjectRole,
     TeamObject,
 )
+from gausslite.domain.task import noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.store import FusionStore
 from gausslite.nouns import same_kind
@@ -77,7 +78,7 @@ def merge_objects(
     moved = {name: _moved(report, frames[name]) if name in frames else report for name, report in reports.items()}
     observed = sorted(
         (
-            _Observed(agent_id, landmark, report.target_index(landmark.noun))
+            _Observed(agent_id, landmark, _target_index(report, landmark.noun))
             for agent_id, report in moved.items()
             for landmark in report.objects
         ),
@@ -342,6 +343,12 @@ def find_objects(objects: Sequence[TeamObject], noun: str = "") -> tuple[TeamObj
         raise InvalidInputError(f"noun: expected a noun phrase such as 'mug', got {quote_name(noun)}")
     is_meant = {name: same_kind(phrase, name) for name in {found.landmark.noun for found in objects}}
     return tuple(found for found in objects if is_meant[found.landmark.noun])
+
+
+def _target_index(report: ObjectReport, noun: str) -> int:
+    """Return the index of a noun among the task's targets, as in a Gaussian's `target`; -1 for other nouns."""
+    nouns = [noun_of(target) for target in report.graph.targets]
+    return nouns.index(noun) if noun in nouns else -1
 
 
 def _moved(report: ObjectReport, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectReport:

@@ -7,12 +7,14 @@ import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
 from gausslite.config.command_parser import bounded
 from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError, MismatchError
-from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
-from gausslite.fusion.vote import fuse_maps
+from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid, group_by_voxel
+from gausslite.fusion.vote import fuse
 from gausslite.mission.results import MAP_FILE, as_text, map_file, prepare_file
 from gausslite.process import print_message
 
@@ -51,10 +53,13 @@ def run(options: argparse.Namespace) -> int:
     prepare_file(options.out.absolute(), MAP_FILE)
     # the vote's last tie-break is the lower id: number the files in the given order
     maps = {f"{i:03d} {path}": read_ply(path, print_message) for i, path in enumerate(files)}
-    fused = fuse_maps(maps, VoxelGrid(options.voxel_size))
+    grid = VoxelGrid(options.voxel_size)
+    fused = fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})
     write_ply(options.out, fused.gaussians, world_frame)
     _print_unnamed(frames, world_frame)
-    voxels_won = {agent_id[4:]: int(fused.won_by(agent_id).sum()) for agent_id in maps}
+    winners = fused.vote.winners
+    won = np.bincount(winners.agent_index, minlength=len(winners.agents))
+    voxels_won = {agent_id[4:]: int(won[winners.agents.index(agent_id)]) for agent_id in maps}
     if options.json:
         report = {"gaussians": len(fused.gaussians), "voxels": len(fused.batch), "voxels_won": voxels_won}
         print(as_text(report))

@@ -157,14 +157,14 @@ class FrameMonitor(LocalisationMonitor):
         """Compare a frame with the map at the odometry's pose."""
         T, rendered = mapper.poses.T_corrected_odometry, None
         placed = frame if T is None else replace(frame, T_world_camera=orthonormal(T @ frame.T_world_camera))
-        if mapper.count:
+        if mapper.table.count:
             rendered = RenderedView.from_rendering(mapper.render(frame.camera, placed.T_world_camera, frame.motion))
         return compare(placed, rendered, self._earlier)
 
     def _by_images(self, frame: Frame, mapper: GaussianMapper) -> Float64[ndarray, "4 4"] | None:
         """Return T_map_odometry of an odometry whose jump the images have measured, if the map shows the same."""
         T_before_now = self._steps.T_before_now
-        if T_before_now is None or self._is_continued or not mapper.count:
+        if T_before_now is None or self._is_continued or not mapper.table.count:
             return None
         T = mapper.poses.T_corrected_odometry
         T_map_now = T_before_now if T is None else T @ T_before_now

@@ -23,7 +23,7 @@ class PlaceSearch:
     def __init__(self, mapper: GaussianMapper, prior: PriorMap | None) -> None:
         """Describe the keyframes of the map and, rendered, of the earlier map, which takes some 50 ms for each."""
         self._places = PlaceMap(mapper.render)
-        for keyframe in mapper.keyframes():
+        for keyframe in mapper.store.kept:
             self._places.add(View.of(keyframe.frame), keyframe.frame.T_world_camera)
         if isinstance(prior, PriorRun) and prior.motion is not None:
             for view in prior.saved.keyframes:

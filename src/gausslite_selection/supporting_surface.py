@@ -86,7 +86,8 @@ class SupportingSurfaces:
         """
         if not self.is_by_height(relation):
             return None
-        bottom_m = votes.lowest_m(self.up, _LOWEST_PERCENTILE)
+        surface_levels_m = votes.surface_m.astype(np.float64) @ self.up
+        bottom_m = float(np.percentile(surface_levels_m, _LOWEST_PERCENTILE)) if len(surface_levels_m) else np.nan
         return stands_on(noun_of(relation.anchor), levels_m, self.floor.level_m, bottom_m)
 
 

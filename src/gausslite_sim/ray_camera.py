@@ -9,6 +9,12 @@ from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.errors import InvalidInputError
+
+_NEWTON_STEPS = 20
+_NEWTON_DIFFERENCE = 1e-6
+_TOLERANCE = 1e-7
+"""Largest error of an undistorted slope, distorted again: far below a pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,5 +64,29 @@ class RayCamera:
         """Return the slopes of the rays through these image coordinates. Raises InvalidInputError."""
         x, y = self.camera.slopes(columns, rows)
         if self.lens is not None:
-            x, y = self.lens.undistort(x.astype(np.float64), y.astype(np.float64))
+            x, y = undistorted(self.lens, x.astype(np.float64), y.astype(np.float64))
         return x.astype(np.float32), y.astype(np.float32)
+
+
+def undistorted(
+    lens: Lens, x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]
+) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
+    """Return the slopes of the rays that meet the image plane at (x, y): the inverse of `Lens.distort`, by Newton.
+
+    Raises InvalidInputError for a point that no ray meets, beyond the range in which the model can be inverted.
+    """
+    u, v, h = x, y, _NEWTON_DIFFERENCE
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            error_x, error_y = (at - to for at, to in zip(lens.distort(u, v), (x, y), strict=True))
+            if max(np.abs(error_x).max(initial=0.0), np.abs(error_y).max(initial=0.0)) <= _TOLERANCE:
+                return u, v
+            right, left, below, above = (lens.distort(u + du, v + dv) for du, dv in ((h, 0), (-h, 0), (0, h), (0, -h)))
+            xu, yu, xv, yv = right[0] - left[0], right[1] - left[1], below[0] - above[0], below[1] - above[1]
+            scale = 2 * h / (xu * yv - xv * yu)
+            u, v = u - scale * (yv * error_x - xv * error_y), v - scale * (xu * error_y - yu * error_x)
+    worst = int(np.argmax(np.nan_to_num(np.hypot(error_x, error_y), nan=np.inf)))
+    raise InvalidInputError(
+        f"lens {lens}: expected a model that can be inverted over the image, "
+        f"got none at the slope ({x[worst]:.2f}, {y[worst]:.2f})"
+    )

@@ -48,14 +48,8 @@ def acknowledged_by(journal: Path, *messages: bytes) -> AgentAcknowledgements:
     [
         ("", StoreComparison(3, 0, 0, 0)),
         # the row of each message: cells 0 and 1, then a tombstone of 0, and 2
-        (
-            "min",
-            StoreComparison(3, 1, 0, 0),
-        ),
-        (
-            "max",
-            StoreComparison(3, 2, 0, 1),
-        ),
+        ("min", StoreComparison(3, 1, 0, 0)),
+        ("max", StoreComparison(3, 2, 0, 1)),
     ],
 )
 def test_a_store_without_an_acknowledged_update_is_found(

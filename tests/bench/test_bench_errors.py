@@ -69,10 +69,7 @@ def test_a_wrong_option_is_one_line(
 
 @pytest.mark.parametrize(
     ("call", "message"),
-    [
-        (lambda: HomeTeamPlan(1, 5), "agents"),
-        (lambda: seed_rows(5), "at least 12, one per view, got 5"),
-    ],
+    [(lambda: HomeTeamPlan(1, 5), "agents"), (lambda: seed_rows(5), "at least 12, one per view, got 5")],
 )
 def test_a_wrong_argument_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):

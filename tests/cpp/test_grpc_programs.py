@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agent_running import TASK, agent
-from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset, request
+from agent_running import TASK, Agent
+from fusion_running import CAMERA, GRID, RunningServer, frame, make_subset, request
 
 from gausslite.codec.ply import read_ply
 from gausslite.domain.voxels import group_by_voxel
@@ -38,14 +38,13 @@ def run(*command):
 
 
 @pytest.mark.timeout(1200)
-def test_the_fetched_map_is_that_of_the_python_client(programs, tmp_path):
-    with fusion_server() as running:
-        session = running.client.join("ant", GRID).session_id
-        subset = make_subset("ant", 1, {0: [4], 1: [2, 2], 5: [9] * 30})
-        list(running.client.contribute([request(session, subset)], 20.0))
-        done = run(programs / "gausslite_fetch_map", running.client.address, tmp_path / "map.ply")
-        assert done.returncode == 0, done.stderr
-        update = next(running.client.watch())
+def test_the_fetched_map_is_that_of_the_python_client(fusion: RunningServer, programs, tmp_path):
+    session = fusion.client.join("ant", GRID).session_id
+    subset = make_subset("ant", 1, {0: [4], 1: [2, 2], 5: [9] * 30})
+    list(fusion.client.contribute([request(session, subset)], 20.0))
+    done = run(programs / "gausslite_fetch_map", fusion.client.address, tmp_path / "map.ply")
+    assert done.returncode == 0, done.stderr
+    update = next(fusion.client.watch())
     expected = update.batch.gaussians
     got = group_by_voxel(read_ply(tmp_path / "map.ply"), GRID).gaussians
     assert len(got) == len(expected) == 33
@@ -54,7 +53,7 @@ def test_the_fetched_map_is_that_of_the_python_client(programs, tmp_path):
 
 
 @pytest.mark.timeout(1200)
-def test_a_folder_of_frames_is_mapped(programs, tmp_path):
+def test_a_folder_of_frames_is_mapped(robot: Agent, programs, tmp_path):
     (tmp_path / "camera.txt").write_text(
         f"{CAMERA.fx_px} {CAMERA.fy_px} {CAMERA.cx_px} {CAMERA.cy_px} {CAMERA.width_px} {CAMERA.height_px}\n"
     )
@@ -63,19 +62,17 @@ def test_a_folder_of_frames_is_mapped(programs, tmp_path):
         (tmp_path / f"{index:04}.color.png").write_bytes(encode_colour(image.rgb, lossless=True))
         (tmp_path / f"{index:04}.depth.png").write_bytes(encode_depth(image.depth_m))
         np.savetxt(tmp_path / f"{index:04}.pose.txt", image.T_world_camera)
-    with agent() as running:
-        done = run(programs / "gausslite_stream_frames", running.client.address, tmp_path, TASK)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.startswith("4 frames mapped; mission ended: 4 frames")
-        assert running.client.status().gaussians > 0
+    done = run(programs / "gausslite_stream_frames", robot.client.address, tmp_path, TASK)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("4 frames mapped; mission ended: 4 frames")
+    assert robot.client.status().gaussians > 0
 
 
 @pytest.mark.timeout(1200)
-def test_errors_are_one_line(programs, tmp_path):
+def test_errors_are_one_line(robot: Agent, programs, tmp_path):
     nowhere = run(programs / "gausslite_fetch_map", "127.0.0.1:9", tmp_path / "map.ply")
     assert nowhere.returncode == 2
     assert len(nowhere.stderr.splitlines()) == 1
-    with agent() as running:
-        empty = run(programs / "gausslite_stream_frames", running.client.address, tmp_path, TASK)
+    empty = run(programs / "gausslite_stream_frames", robot.client.address, tmp_path, TASK)
     assert empty.returncode == 2
     assert "camera.txt: expected a readable file" in empty.stderr

@@ -15,14 +15,7 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_agent.settings import parse_arguments
-from gausslite_demo.services import (
-    AgentPlan,
-    DemoPlan,
-    RunningService,
-    RunningServices,
-    ServiceProcess,
-    watch_missions,
-)
+from gausslite_demo.services import AgentPlan, DemoPlan, RunningService, RunningServices, ServiceProcess, watch_missions
 
 
 def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
@@ -42,9 +35,7 @@ def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
         MissionSettings(),
         MissionSettings(policy="uniform", iterations=3, seed=7, threads=2, max_gaussians=99, backend="cpu"),
         MissionSettings(
-            disabled=frozenset({"sb", "gfd"}),
-            rate_hz=4.5,
-            pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.03),
+            disabled=frozenset({"sb", "gfd"}), rate_hz=4.5, pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.03)
         ),
     ],
 )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, middle_relevance, wall_frame
 
 from gausslite.domain.errors import InvalidInputError, KernelError
 from gausslite.mapping.mapper import GaussianMapper
@@ -39,7 +39,7 @@ def mapped(rasterizer: Rasterizer, seed: int = 0) -> GaussianMapper:
     mapper = GaussianMapper(SETTINGS, rasterizer, seed)
     for index in range(2):
         frame = wall_frame(index, SIZE, shift_m=0.1 * index)
-        mapper.map_frame(frame, middle_relevance(frame))
+        map_frame(mapper, frame)
     return mapper
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from agent_running import agent
-from fusion_running import GRAPH, GRID, MUG, fusion_server, make_subset
+from agent_running import Agent
+from fusion_running import GRAPH, GRID, MUG, RunningServer, make_subset
 from small_room import write_room
 
 from gausslite.cli.main import main
@@ -104,18 +104,17 @@ def test_errors_are_those_of_the_library(folder: Path) -> None:
         assert "Traceback" not in result.content[0].text
 
 
-def test_the_objects_and_the_map_of_a_server_are_those_of_now() -> None:
-    with fusion_server() as running:
-        tools = PlaceTools(open_place(running.client.address))
-        assert tools.list_objects("")["count"] == 0
-        session = running.client.join("a", GRID)
-        running.client.report_objects(session.session_id, ObjectReport(GRAPH, (MUG,)))
-        running.contribute_subsets(session.session_id, make_subset("a", 1, {0: [1, 1]}))
-        assert [found["noun"] for found in tools.list_objects("mug")["objects"]] == ["mug"]
-        first = tools.place.scene()
-        assert tools.place.scene() is first
-        running.contribute_subsets(session.session_id, make_subset("a", 2, {1: [1, 1]}))
-        assert len(tools.place.scene().splats.gaussians) > len(first.splats.gaussians)
+def test_the_objects_and_the_map_of_a_server_are_those_of_now(fusion: RunningServer) -> None:
+    tools = PlaceTools(open_place(fusion.client.address))
+    assert tools.list_objects("")["count"] == 0
+    session = fusion.client.join("a", GRID)
+    fusion.client.report_objects(session.session_id, ObjectReport(GRAPH, (MUG,)))
+    fusion.contribute_subsets(session.session_id, make_subset("a", 1, {0: [1, 1]}))
+    assert [found["noun"] for found in tools.list_objects("mug")["objects"]] == ["mug"]
+    first = tools.place.scene()
+    assert tools.place.scene() is first
+    fusion.contribute_subsets(session.session_id, make_subset("a", 2, {1: [1, 1]}))
+    assert len(tools.place.scene().splats.gaussians) > len(first.splats.gaussians)
 
 
 def over_http(server: Any, token: str | None, call: tuple[str, dict[str, Any]]) -> Any:
@@ -160,12 +159,11 @@ def test_over_http_a_token_gives_its_role_and_none_gives_nothing(folder: Path) -
     assert "expected the role operator, got viewer" in result.content[0].text
 
 
-def test_an_operator_assigns_a_task_to_the_agent(folder: Path) -> None:
-    with agent() as running:
-        tools = PlaceTools(open_place(str(folder), threads=1), agent=running.client.address)
-        [result] = answers(build_server(tools), ("assign_task", {"task": "Find the cup on the table"}))
-        assert values(result)["targets"] == ["cup"]
-        assert "cup" in str(running.client.status())
+def test_an_operator_assigns_a_task_to_the_agent(robot: Agent, folder: Path) -> None:
+    tools = PlaceTools(open_place(str(folder), threads=1), agent=robot.client.address)
+    [result] = answers(build_server(tools), ("assign_task", {"task": "Find the cup on the table"}))
+    assert values(result)["targets"] == ["cup"]
+    assert "cup" in str(robot.client.status())
 
 
 @pytest.mark.parametrize(

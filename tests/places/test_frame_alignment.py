@@ -160,11 +160,7 @@ def box_on_table(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "points",
-    [
-        box_on_table(1),
-        table_part(1, 0.55, 1.0),
-        np.vstack([box_on_table(1), table_part(1, 0.45, 0.8)]),
-    ],
+    [box_on_table(1), table_part(1, 0.55, 1.0), np.vstack([box_on_table(1), table_part(1, 0.45, 0.8)])],
     ids=["a box on the table", "another part of the table", "box and another part"],
 )
 def test_correct_frames_of_regions_that_hardly_overlap_stay_as_they_are(points: np.ndarray) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, middle_relevance, wall_frame
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
@@ -88,17 +88,17 @@ def mapped(prior: PoseExposurePrior, displacement_m: float = 0.0, decay_after_up
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(4):
         frame = displaced(wall_frame(index, SIZE, shift_m=0.05 * index), displacement_m * (index % 2), 0.0)
-        mapper.map_frame(frame, middle_relevance(frame))
+        map_frame(mapper, frame)
     return mapper
 
 
 def test_an_exact_prior_leaves_the_views_as_recorded() -> None:
-    for keyframe in mapped(PoseExposurePrior()).keyframes():
+    for keyframe in mapped(PoseExposurePrior()).store.kept:
         assert keyframe.recorded is None
 
 
 def test_a_very_tight_prior_leaves_poses_and_colours_unchanged() -> None:
-    keyframes = mapped(PoseExposurePrior(1e-9, 1e-9, 1e-9, 1e-9)).keyframes()
+    keyframes = mapped(PoseExposurePrior(1e-9, 1e-9, 1e-9, 1e-9)).store.kept
     assert all(keyframe.recorded is not None for keyframe in keyframes[1:])
     for keyframe in keyframes[1:]:
         np.testing.assert_allclose(keyframe.frame.T_world_camera, keyframe.recorded.T_world_camera, atol=1e-9)
@@ -111,7 +111,7 @@ def test_learning_rates_decay_with_exact_poses_too(prior: PoseExposurePrior) -> 
     before = [mapper.gaussians().rgb for mapper in (decaying, constant)]
     frame = wall_frame(4, SIZE, shift_m=0.2)
     for mapper in (decaying, constant):
-        mapper.map_frame(frame, middle_relevance(frame))
+        map_frame(mapper, frame)
     moved = [
         float(np.abs(mapper.gaussians().rgb[: len(old)] - old).mean())
         for mapper, old in zip((decaying, constant), before, strict=True)
@@ -121,7 +121,7 @@ def test_learning_rates_decay_with_exact_poses_too(prior: PoseExposurePrior) -> 
 
 def test_keyframes_with_contradicting_poses_converge() -> None:
     # on one flat wall a shift and a rotation look alike, so the prior fixes the rotation
-    keyframes = mapped(PoseExposurePrior(0.05, 0.0), displacement_m=0.03).keyframes()[1:]
+    keyframes = mapped(PoseExposurePrior(0.05, 0.0), displacement_m=0.03).store.kept[1:]
 
     def errors_m(poses: list[np.ndarray]) -> list[float]:
         true = [wall_frame(k.frame.index, SIZE, shift_m=0.05 * k.frame.index).T_world_camera for k in keyframes]

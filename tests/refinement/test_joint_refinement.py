@@ -22,7 +22,7 @@ from gausslite.fusion.limits import Quotas
 from gausslite.fusion.refinement import RefineInput, RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import Rasterizer
+from gausslite.render.rasterizer import Rasterizer, gaussians_to_rows
 from gausslite.wire.convert import decode_frame
 from gausslite_refinement.refinement import Refinement
 
@@ -97,11 +97,9 @@ def test_pixels_that_occlude_the_map_are_not_trained() -> None:
 def test_a_refinement_ends_when_it_no_longer_improves_and_is_never_worse_than_the_vote() -> None:
     # the map is the photograph already, so that every step makes it worse
     before = patch(GREY / 255)
-    perfect = Refinement(vote(before, [view(1)]), CpuRasterizer(1, "portable"), RefineSettings())
-    rows = perfect._pool._views[0]
-    rendering = CpuRasterizer(1, "portable").forward(perfect._best_rows, CAMERA, np.eye(4))
+    rendering = CpuRasterizer(1, "portable").forward(gaussians_to_rows(before), CAMERA, np.eye(4))
     seen = np.rint(np.clip(rendering.rgb, 0, 1) * 255).astype(np.uint8)
-    own = AgentKeyframe("ant", dataclasses.replace(rows.frame, rgb=seen, depth_m=rendering.expected_depth_m()))
+    own = AgentKeyframe("ant", Frame(1, 1, seen, rendering.expected_depth_m(), CAMERA, np.eye(4)))
     settings = RefineSettings(iterations=1000, check_every=10)
     after, progress = refine(before, [own], CpuRasterizer(1, "portable"), settings)
     assert progress[-1].iteration == progress[-1].iterations < 1000
@@ -116,8 +114,8 @@ def test_uncached_views_are_trained(uncached: int) -> None:
 
 
 def test_the_iterations_grow_with_the_map() -> None:
-    small = Refinement(vote(patch(0.2), [view(1)]), ReferenceRasterizer(), RefineSettings())
-    assert small._iterations == 500
+    small = Refinement(vote(patch(0.2), [view(1)]), ReferenceRasterizer(), RefineSettings(report_every=1))
+    assert next(small.steps()).iterations == 500
 
 
 WRONG = {"colour": view(3, 200, agent_id="bee"), "depth": view(3, depth_m=1.3, agent_id="bee")}

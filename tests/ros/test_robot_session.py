@@ -136,7 +136,7 @@ def test_a_replayed_bag_is_mapped_as_the_bag_source_gives_it(tmp_path: Path, del
         assert running.client.status().frames_mapped == len(source)
 
 
-def test_a_map_that_cannot_be_published_is_reported_and_the_next_one_is_published() -> None:
+def test_a_map_that_cannot_be_published_is_reported_and_the_next_one_is_published(robot: Agent) -> None:
     calls: list[list[Outgoing]] = []
 
     def publish(messages: list[Outgoing]) -> None:
@@ -144,7 +144,7 @@ def test_a_map_that_cannot_be_published_is_reported_and_the_next_one_is_publishe
         if len(calls) == 1:
             raise MemoryError("no room for the grid")
 
-    with agent() as running, opened(running, PARAMETERS) as (session, _):
+    with opened(robot, PARAMETERS) as (session, _):
         session.follow_map(publish, lambda: NOW_NS)
         wait_until(lambda: "no room for the grid" in str(session.status(NOW_NS)[0].fields))
         wait_until(lambda: len(calls) > 1)
@@ -152,8 +152,8 @@ def test_a_map_that_cannot_be_published_is_reported_and_the_next_one_is_publishe
         session.close()
 
 
-def test_a_task_topic_assigns_the_task() -> None:
-    with agent() as running, opened(running, PARAMETERS) as (session, link):
+def test_a_task_topic_assigns_the_task(robot: Agent) -> None:
+    with opened(robot, PARAMETERS) as (session, link):
         [assign] = [each.callback for each in session.subscriptions() if each.topic == TASK_TOPIC]
         assign(SimpleNamespace(data="Pick up the mug on the table"))
         wait_until(lambda: link.snapshot is not None and link.snapshot.task == TASK)
@@ -162,32 +162,31 @@ def test_a_task_topic_assigns_the_task() -> None:
         assert status.message == f"mapping: no colour images on {COLOUR} yet"
 
 
-def test_a_camera_that_sends_no_more_images_is_a_warning(tmp_path: Path) -> None:
+def test_a_camera_that_sends_no_more_images_is_a_warning(robot: Agent, tmp_path: Path) -> None:
     write_robot_bag(tmp_path / "b.mcap")
-    with agent() as running:
-        parameters, now_s = replace(PARAMETERS, agent=running.client.address), [100.0]
-        link = AgentLink(AgentClient(parameters.agent), parameters.link_settings())
-        session = RobotSession(parameters, link, lambda: now_s[0])
-        readers = {each.topic: each.callback for each in session.subscriptions()}
+    parameters, now_s = replace(PARAMETERS, agent=robot.client.address), [100.0]
+    link = AgentLink(AgentClient(parameters.agent), parameters.link_settings())
+    session = RobotSession(parameters, link, lambda: now_s[0])
+    readers = {each.topic: each.callback for each in session.subscriptions()}
 
-        def problems(silent_s: float) -> list[str]:
-            now_s[0] += silent_s
-            values = session.status(NOW_NS)[0].fields["status"][0]["values"]
-            return [pair["value"] for pair in values if pair["key"].startswith("problem")]
+    def problems(silent_s: float) -> list[str]:
+        now_s[0] += silent_s
+        values = session.status(NOW_NS)[0].fields["status"][0]["values"]
+        return [pair["value"] for pair in values if pair["key"].startswith("problem")]
 
-        messages = list(arrivals(tmp_path / "b.mcap", {}))
-        for topic, message in messages:
-            readers[topic](message)
-        assert not any("no colour images" in text for text in problems(0.0))
-        assert f"no colour images on {COLOUR} for 8 s" in problems(8.0)
-        readers[COLOUR](next(message for topic, message in messages if topic == COLOUR))
-        assert not any("no colour images" in text for text in problems(8.0))
-        link.close(end_mission=False)
+    messages = list(arrivals(tmp_path / "b.mcap", {}))
+    for topic, message in messages:
+        readers[topic](message)
+    assert not any("no colour images" in text for text in problems(0.0))
+    assert f"no colour images on {COLOUR} for 8 s" in problems(8.0)
+    readers[COLOUR](next(message for topic, message in messages if topic == COLOUR))
+    assert not any("no colour images" in text for text in problems(8.0))
+    link.close(end_mission=False)
 
 
-def test_a_message_that_cannot_be_read_is_reported_and_does_not_stop_the_node(tmp_path: Path) -> None:
+def test_a_message_that_cannot_be_read_is_reported_and_does_not_stop_the_node(robot: Agent, tmp_path: Path) -> None:
     options = write_robot_bag(tmp_path / "b.mcap")
-    with agent() as running, opened(running, PARAMETERS) as (session, _):
+    with opened(robot, PARAMETERS) as (session, _):
         readers = {each.topic: each.callback for each in session.subscriptions()}
         for topic, message in arrivals(tmp_path / "b.mcap", {}):
             if topic == "/tf":

@@ -80,11 +80,7 @@ def wall(depth_m: float) -> Frame:
         ({"points_px": [(float("nan"), 10)]}, 1.0, "point nan,10: expected a pixel of the image of 80x60"),
         ({"points_px": [(4, 10)]}, 0.0, "point 4,10: expected a pixel with depth, frame 7 has none there"),
         ({"boxes_px": [(4, 4, 9, 9)]}, 0.0, "box 4,4,9,9: expected pixels with depth, frame 7 has none there"),
-        (
-            {"boxes_px": [(9, 4, 4, 9)]},
-            1.0,
-            "box 9,4,4,9: expected left,top,right,bottom in the image of 80x60",
-        ),
+        ({"boxes_px": [(9, 4, 4, 9)]}, 1.0, "box 9,4,4,9: expected left,top,right,bottom in the image of 80x60"),
         ({}, 1.0, "points: expected at least one point or box, got none"),
     ],
 )

@@ -21,10 +21,7 @@ from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite_selection.superlatives import select_extreme
 
 EYE_M = np.array((0.0, -1.0, -3.0))
-MIRRORED = {
-    Predicate.LEFT_OF: Predicate.RIGHT_OF,
-    Predicate.BEHIND: Predicate.IN_FRONT_OF,
-}
+MIRRORED = {Predicate.LEFT_OF: Predicate.RIGHT_OF, Predicate.BEHIND: Predicate.IN_FRONT_OF}
 
 
 def box(phrase: str, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> Observation:

@@ -9,9 +9,10 @@ import pytest
 
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.errors import InvalidInputError
 from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.home_plan import HomePlan
-from gausslite_sim.ray_camera import RayCamera
+from gausslite_sim.ray_camera import RayCamera, undistorted
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
 from gausslite_sim.scene import HomeScene
 from gausslite_sim.view import render_view
@@ -71,7 +72,7 @@ def test_a_lens_moves_what_the_pinhole_shows_by_its_distortion(scene: HomeScene,
     lens, T_world_camera = Lens.parse(text), poses_at(np.zeros(1))[0]
     distorted = render_view(scene, RayCamera(CAMERA, T_world_camera, lens))
     rows, columns = np.array([5, 30, 50, 55]), np.array([4, 41, 70, 12])
-    x, y = lens.undistort((columns + 0.5 - CAMERA.cx_px) / CAMERA.fx_px, (rows + 0.5 - CAMERA.cy_px) / CAMERA.fy_px)
+    x, y = undistorted(lens, (columns + 0.5 - CAMERA.cx_px) / CAMERA.fx_px, (rows + 0.5 - CAMERA.cy_px) / CAMERA.fy_px)
     directions = (np.stack([x, y, np.ones_like(x)], axis=1) @ T_world_camera[:3, :3].T).astype(np.float32)
     eyes = np.repeat(T_world_camera[None, :3, 3], len(x), axis=0).astype(np.float32)
     np.testing.assert_allclose(distorted.depth_m[rows, columns], scene.cast(eyes, directions).distance, rtol=1e-3)
@@ -84,3 +85,16 @@ def test_all_options_work_together() -> None:
     assert source.lens is None
     assert frame.has_depth
     assert frame.rgb.tobytes() == open_source(spec).frame(7).rgb.tobytes()
+
+
+@pytest.mark.parametrize(
+    "text", ["radtan:-0.2,0.05,0.002,-0.001", "radtan:0.2624,-0.9531,-0.0054,0.0026,1.1633", "fisheye:0.1,0.02,0,0"]
+)
+def test_undistorted_points_are_distorted_back_to_where_they_were(text: str) -> None:
+    lens, points = Lens.parse(text), np.random.default_rng(0).uniform(-0.56, 0.56, (2, 200))
+    np.testing.assert_allclose(lens.distort(*undistorted(lens, *points)), points, atol=1e-6)
+
+
+def test_a_slope_that_no_ray_meets_is_named() -> None:
+    with pytest.raises(InvalidInputError, match="inverted"):
+        undistorted(Lens.parse("radtan:-1,0,0,0"), np.array([0.1, 2.0]), np.zeros(2))

@@ -10,7 +10,8 @@ from gausslite.datasets.source import Source
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import require_rigid
 from gausslite_sim.exposure import camera_gain
-from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
+from gausslite_sim.home_catalogue import HOME_COUNT, HOMES, plan_home
+from gausslite_sim.home_settings import HomeSettings
 from gausslite_sim.homes import workshop
 from gausslite_sim.materials import paint
 from gausslite_sim.trajectory import spline_trajectory
@@ -122,9 +123,10 @@ def test_objects_can_be_shifted_or_left_out() -> None:
     small = "sim:home-2?size=64x48&noise=0"
     before, after = (open_source(f"{small}{changes}") for changes in ("", "&changes=stool:-0.3:0.2,mug:gone"))
     assert before.regions().keys() - after.regions().keys() == {"mug"}
+    plan, changes = plan_home(2, seed=0), dict(HomeSettings.parse("changes=stool:-0.3:0.2").changes)
     stool_m = [
-        next(item for item in source._home.plan.items if item.name == "stool").parts[0].mesh.positions_m.mean(axis=0)  # type: ignore[attr-defined]
-        for source in (before, after)
+        next(item for item in own.items if item.name == "stool").parts[0].mesh.positions_m.mean(axis=0)
+        for own in (plan, plan.with_changes(changes))
     ]
     np.testing.assert_allclose(stool_m[1] - stool_m[0], (-0.3, 0.2, 0.0), atol=1e-6)
     with pytest.raises(DatasetError, match=r"changes: expected objects among .*stool.*, got sofa"):

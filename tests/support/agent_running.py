@@ -76,7 +76,7 @@ def agent(
     uplink: Uplink | None = None,
     queue_frames: int = 4,
     options: Sequence[str] = (),
-    listen: str = "127.0.0.1:0",
+    listen: str | None = None,
 ) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []

@@ -81,10 +81,7 @@ class RunningServer:
 
 def request(session_id: str, subset: RoiSubset, grid: VoxelGrid = GRID) -> pb.ContributeSubsetsRequest:
     return pb.ContributeSubsetsRequest(
-        session_id=session_id,
-        sequence=subset.message_seq,
-        purpose=pb.PURPOSE_ROI,
-        subset=encode_subset(subset, grid),
+        session_id=session_id, sequence=subset.message_seq, purpose=pb.PURPOSE_ROI, subset=encode_subset(subset, grid)
     )
 
 
@@ -94,10 +91,10 @@ def fusion_server(
     settings: FusionSettings | None = None,
     refine: RefineSettings | None = None,
     tls: Tls | None = None,
-    address: str = "127.0.0.1:0",
+    address: str | None = None,
     aligner: FrameAligner | None = None,
 ) -> Iterator[RunningServer]:
-    """Start a fusion server on a free port or `address` with the reference rasterizer; the caller owns the store.
+    """Start a fusion server as `serving` does, with the reference rasterizer; the caller owns the store.
 
     With tls the client uses the server's certificate; the stub and the channel do not work then.
     """

@@ -7,6 +7,8 @@ import numpy as np
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
+from gausslite.mapping.mapper import FrameView, GaussianMapper, MappedFrame
+from gausslite.mapping.training import CountedScheduler, StageScheduler
 from gausslite.render.rasterizer import Rendering
 
 
@@ -29,6 +31,14 @@ def middle_relevance(frame: Frame) -> RelevanceMap:
     pixel_weights = np.zeros((height, width), np.float32)
     pixel_weights[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 1.0
     return RelevanceMap(pixel_weights, np.where(pixel_weights > 0, 0, -1).astype(np.int16))
+
+
+def map_frame(
+    mapper: GaussianMapper, frame: Frame, relevance: RelevanceMap | None = None, scheduler: StageScheduler | None = None
+) -> MappedFrame:
+    """Map a frame as it is, with things that move; without a relevance that of `middle_relevance`."""
+    seen = middle_relevance(frame) if relevance is None else relevance
+    return mapper.map_view(FrameView(frame), seen, scheduler or CountedScheduler())
 
 
 def rendering_of(alpha: np.ndarray, depth_m: np.ndarray) -> Rendering:

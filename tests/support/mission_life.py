@@ -97,12 +97,7 @@ def stream(agent: ProtoClient, frames: Sequence[dict[str, Any]]) -> int:
 
 
 def live(
-    folder: Path,
-    frames: Sequence[dict[str, Any]],
-    task: str,
-    agent_options: Sequence[str],
-    kill: bool,
-    noun: str = "",
+    folder: Path, frames: Sequence[dict[str, Any]], task: str, agent_options: Sequence[str], kill: bool, noun: str = ""
 ) -> Life:
     """Run a fusion server, an agent and a whole mission; kill: kill and restart the agent in the middle."""
     start_s = time.monotonic()

@@ -18,10 +18,7 @@ MASK_COEFFICIENTS = 32
 
 
 def write_tiny_yolo(
-    path: Path,
-    names: Sequence[str],
-    boxes: Sequence[tuple[float, float, float, float, int, float]],
-    named: bool = True,
+    path: Path, names: Sequence[str], boxes: Sequence[tuple[float, float, float, float, int, float]], named: bool = True
 ) -> Path:
     """Write a model with these constant boxes: centre x, y, width, height, class, score."""
     output = np.zeros((1, 4 + len(names) + MASK_COEFFICIENTS, max(len(boxes), 1)), np.float32)
@@ -62,10 +59,7 @@ def write_tiny_yolo(
 
 
 def write_boxes_only(
-    path: Path,
-    names: Sequence[str],
-    boxes: Sequence[tuple[float, float, float, float, int, float]],
-    more_rows: int = 0,
+    path: Path, names: Sequence[str], boxes: Sequence[tuple[float, float, float, float, int, float]], more_rows: int = 0
 ) -> Path:
     """Write a detector with these constant boxes and without masks: [1, 4+c, A], after it more_rows of zeros."""
     output = np.zeros((1, 4 + len(names) + more_rows, len(boxes)), np.float32)

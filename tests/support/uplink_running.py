@@ -12,9 +12,7 @@ from fusion_running import GRID, make_batch
 from serving import serving
 
 from gausslite.codec.subset_codec import decode_subset
-from gausslite.domain.errors import (
-    GaussLiteError,
-)
+from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -115,8 +113,7 @@ def scripted(
 ) -> Iterator[tuple[ScriptedServer, str]]:
     servicer = ScriptedServer(answer)
     service = Service(
-        "gausslite.v1.FusionService",
-        lambda server: pb_grpc.add_FusionServiceServicer_to_server(servicer, server),
+        "gausslite.v1.FusionService", lambda server: pb_grpc.add_FusionServiceServicer_to_server(servicer, server)
     )
     with serving([service]) as running:
         yield servicer, running.address

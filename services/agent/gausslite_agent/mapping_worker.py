@@ -27,6 +27,7 @@ from gausslite.domain.pose import PoseCorrection
 from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
+from gausslite.mapping.free_space import without_guesses
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
@@ -45,6 +46,12 @@ from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.settings import LoadSettings
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
 
+_Result = TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
+_log = logging.getLogger(__name__)
+_IDLE_WAIT_S = 10.0
+LOCALISING = "the agent localises itself in the map of --prior"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueuedFrame:
@@ -57,13 +64,6 @@ class QueuedFrame:
     def __post_init__(self) -> None:
         # else its receiver could cancel it
         self.report.set_running_or_notify_cancel()
-
-
-_Result = TypeVar("_Result")
-_Arguments = ParamSpec("_Arguments")
-_log = logging.getLogger(__name__)
-_IDLE_WAIT_S = 10.0
-LOCALISING = "the agent localises itself in the map of --prior"
 
 
 def _on_worker(
@@ -155,7 +155,7 @@ class MappingWorker:
         self._last_index = checkpoint.last_index
         # the clock may have been set back since the mission was saved
         self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
-        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
+        self._status.update(gaussians=self._mapper.table.count, map_revision=self._map_revision())
         # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
         # and the server may have voxels that the saved map does not
         self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
@@ -235,23 +235,27 @@ class MappingWorker:
         inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
         if inserted:
             count = self.status().team_gaussians + inserted
-            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
+            self._status.update(
+                team_gaussians=count, gaussians=self._mapper.table.count, map_revision=self._map_revision()
+            )
             self._on_change()
 
     @_on_worker
     def handover_batch(self) -> VoxelBatch:
         """Return updates of the whole map, except guesses and voxels of an earlier task sent with a higher Σkappa.
 
-        Guesses: see `GaussianMapper.shared_gaussians`. Voxels of an earlier handover that the map has lost get
+        Guesses: see `without_guesses`. Voxels of an earlier handover that the map has lost get
         tombstones. Raises StorageError.
         """
-        return self._voxels_to_send(self._mapper.shared_gaussians())
+        return self._voxels_to_send(
+            without_guesses(self._mapper.gaussians(), (keyframe.frame for keyframe in self._mapper.store.kept))
+        )
 
     @_on_worker
     def select_keyframes(self) -> None:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
         if self._keyframe_upload is not None:
-            self._keyframe_upload.enqueue_all(self._mapper.keyframes())
+            self._keyframe_upload.enqueue_all(self._mapper.store.kept)
 
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
@@ -343,7 +347,7 @@ class MappingWorker:
             age_s=self._clock() - queued.arrival_s,
         )
         if self._keyframe_upload is not None:
-            self._keyframe_upload.enqueue_newest(self._mapper.keyframes())
+            self._keyframe_upload.enqueue_newest(self._mapper.store.kept)
         self._records.add(outcome, self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
         self._count(report, outcome)

@@ -40,6 +40,12 @@ _REPORTED_UPLINK_COUNTERS = (
     *("handover_bytes", "keyframe_bytes", "keyframes_sent", "keyframes_waiting", "gaussians_sent"),
     *("voxels_sent", "subsets_sent", "subsets_rejected", "voxels_waiting"),
 )
+_log = logging.getLogger(__name__)
+_INTERRUPTED = "interrupted"
+_BEFORE_ALL_NS = -1
+NO_DETECTOR = (
+    "this agent cannot find the objects of a task, because it has no detector; start it with --detector FILE.onnx"
+)
 
 
 def mission_report(
@@ -79,14 +85,6 @@ def mission_report(
         "nouns": [noun_as_json(noun) for noun in status.nouns],
         "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }
-
-
-_log = logging.getLogger(__name__)
-_INTERRUPTED = "interrupted"
-_BEFORE_ALL_NS = -1
-NO_DETECTOR = (
-    "this agent cannot find the objects of a task, because it has no detector; start it with --detector FILE.onnx"
-)
 
 
 class AgentMission:
@@ -346,7 +344,7 @@ class AgentMission:
         }
         report["notes"] = [*self._source_notes, *report["notes"]]
         prior = self._worker.prior
-        keyframes = self._worker.run(lambda mapper: mapper.keyframes()).result()
+        keyframes = self._worker.run(lambda mapper: mapper.store.kept).result()
         changes = compare_with_prior(prior, gaussians, self._worker.status().objects, keyframes)
         for line in changes.lines:
             _log.info("since the earlier map: %s", line)

@@ -44,6 +44,8 @@ from gausslite_agent.state import SavedMission
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 30.0
 _RETRY_S = 0.5
+_MIN_INTERVAL_PER_SAVE = 20.0
+"""Saving takes at most a twentieth of the time."""
 
 
 class TeamMap(Protocol):
@@ -93,10 +95,6 @@ class WaitingParser:
                 if self._stopping.wait(_RETRY_S):
                     waited = "stopped while waiting for the parser service"
                     raise UnavailableError(waited if last_error is None else f"{waited}: {last_error}") from None
-
-
-_MIN_INTERVAL_PER_SAVE = 20.0
-"""Saving takes at most a twentieth of the time."""
 
 
 class PeriodicSave:

@@ -58,6 +58,9 @@ from gausslite_agent.messages import (
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
 
+_OUTCOMES_AHEAD = 16
+_ENCODERS, _MAX_WATCHERS_WAITING = 2, 1024
+
 
 class MapChangeLog:
     """The map's voxels at its latest revision, and the revision at which each last changed. Not thread-safe."""
@@ -101,13 +104,13 @@ class MapChangeLog:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentMapReader:
-    """Reads voxels that lead to a revision. key: what they are, in the cache of all watchers' encoded parts."""
+    """Reads voxels that lead to a revision."""
 
     revision: int
     batch: VoxelBatch
-    key: tuple[Hashable, ...]
-    encode: Callable[[VoxelBatch], tuple[EncodedPart, ...]]
-    cache: EncodedPartCache
+    key: tuple[Hashable, ...]  # what they are, in the cache of all watchers' encoded parts
+    encode: Callable[[VoxelBatch], tuple[EncodedPart, ...]]  # to messages of limited size
+    cache: EncodedPartCache  # of all watchers
 
     def snapshot(self) -> tuple[int, Parts]:
         """Return the revision and, in parts, the voxels: the whole map."""
@@ -120,10 +123,6 @@ class AgentMapReader:
     def _parts(self) -> Iterator[tuple[EncodedPart, ...]]:
         for number, part in enumerate(split_batch(self.batch, BLOCK_BYTES)):
             yield self.cache.get((*self.key, self.revision, number), partial(self.encode, part))
-
-
-_OUTCOMES_AHEAD = 16
-_ENCODERS, _MAX_WATCHERS_WAITING = 2, 1024
 
 
 class NewestTask:
@@ -224,7 +223,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
 
         def render(mapper: GaussianMapper) -> tuple[Rendering | None, int]:
-            return mapper.render(camera, T_world_camera) if mapper.count > 0 else None, self._worker.revision()
+            return mapper.render(camera, T_world_camera) if mapper.table.count > 0 else None, self._worker.revision()
 
         def work() -> pb.RenderViewResponse:
             # only rendered on the mapper's thread

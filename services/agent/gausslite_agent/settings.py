@@ -55,8 +55,8 @@ def _keyframes_unless_set(options: argparse.Namespace) -> int:
 class ConnectionSettings:
     """Connections to the other services.
 
-    parser: None to parse tasks in this process; fusion: None to send nothing. spool: None to keep in memory what waits.
-    With keyframes_during_mission, keyframes are sent while mapping, not only with a handover.
+    spool: None to keep in memory what waits. With keyframes_during_mission, keyframes are sent while mapping, not only
+    with a handover.
     """
 
     parser: str | None = option(
@@ -64,13 +64,13 @@ class ConnectionSettings:
         "parser service (default: parse tasks in this process, by rules)",
         metavar="ADDRESS",
         convert=partial(require_callable, "parser"),
-    )
+    )  # None to parse tasks in this process
     fusion: str | None = option(
         None,
         "fusion server (default: none; nothing is sent)",
         metavar="ADDRESS",
         convert=partial(require_callable, "fusion"),
-    )
+    )  # None to send nothing
     mission_id: str = option(
         "", "mission to join (default: the server's)", key="mission", metavar="ID", convert=_read_mission
     )
@@ -121,7 +121,7 @@ class AgentIdentity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentSettings:
-    """All settings of one agent. source: the sequence that replaces the camera, None for frames by IngestFrames."""
+    """All settings of one agent."""
 
     listen: str = option(AGENT_ADDRESS, "HOST:PORT or unix:PATH", metavar="ADDRESS")
     agent_id: str = option(
@@ -134,7 +134,7 @@ class AgentSettings:
         None, "folder for map.ply and report.json; replaces earlier ones at the end", metavar="DIR"
     )
     exit_when_done: bool = option(False, "exit after the mission (default: continue to serve)")
-    source: SourceSettings | None
+    source: SourceSettings | None  # the sequence that replaces the camera, None for frames by IngestFrames
     link: ConnectionSettings
     mission: MissionSettings
     load: LoadSettings

@@ -26,19 +26,18 @@ from gausslite.v1 import task_pb2
 from gausslite.wire.convert_task import graph_from_message, graph_to_message
 from gausslite.wire.update_sender import UplinkCounters
 
+MAX_DRAIN_S = 86400.0
+_AGES_KEPT = 1000
+
 
 @dataclass(frozen=True, slots=True)
 class MissionCheckpoint:
-    """A mission at the time it was saved.
+    """A mission at the time it was saved."""
 
-    last_index: index of its last frame; graph: its task; requested_task: the task of the command line; map_revision:
-    the latest revision that was sent to watchers.
-    """
-
-    last_index: int
-    graph: TaskGraph
-    requested_task: str
-    map_revision: int
+    last_index: int  # index of its last frame
+    graph: TaskGraph  # its task
+    requested_task: str  # the task of the command line
+    map_revision: int  # the latest revision that was sent to watchers
 
     def state(self) -> State:
         """Return the arrays that are saved with the mapping run."""
@@ -72,15 +71,12 @@ class SavedMission:
         return cls(run, MissionCheckpoint(run.last_index, graph, requested_task, map_revision))
 
 
-MAX_DRAIN_S = 86400.0
-
-
 @dataclass(frozen=True, slots=True)
 class EndRequest:
-    """handover: also send the rest of the map; drain_s: the longest time for sending."""
+    """How a mission is to end."""
 
-    handover: bool
-    drain_s: float
+    handover: bool  # also send the rest of the map
+    drain_s: float  # the longest time for sending
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.drain_s) and 0 <= self.drain_s <= MAX_DRAIN_S):
@@ -89,18 +85,14 @@ class EndRequest:
 
 @dataclass(frozen=True, slots=True)
 class MissionSummary:
-    """The figures of a mission that has ended.
+    """The figures of a mission that has ended."""
 
-    ended_by: why it ended early, None after its regular end. uplink: None without a fusion server. spool: file of the
-    data that was left, None if it is in memory.
-    """
-
-    frames: int
-    hz: float
+    frames: int  # mapped ones
+    hz: float  # mapped frames per second of their processing
     gaussians: int
-    ended_by: str | None
-    uplink: UplinkCounters | None
-    spool: Path | None
+    ended_by: str | None  # why it ended early, None after its regular end
+    uplink: UplinkCounters | None  # None without a fusion server
+    spool: Path | None  # file of the data that was left, None if it is in memory
 
     @property
     def is_complete(self) -> bool:
@@ -179,9 +171,6 @@ class MissionStateMachine:
             )
 
 
-_AGES_KEPT = 1000
-
-
 class Outcome(Enum):
     """Result of a frame."""
 
@@ -193,58 +182,51 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameReport:
-    """The outcome of one frame; reason: why it was not mapped.
+    """The outcome of one frame."""
 
-    seconds: its processing time; age_s: time from its arrival until it was mapped, including its wait in the queue.
-    """
-
-    index: int
+    index: int  # number in the sequence
     outcome: Outcome
-    reason: str = ""
-    iterations: int = 0
-    gaussians: int = 0
-    roi_share: float = 0.0
-    seconds: float = 0.0
-    age_s: float = 0.0
+    reason: str = ""  # why it was not mapped
+    iterations: int = 0  # of training
+    gaussians: int = 0  # in the map afterwards
+    roi_share: float = 0.0  # of the pixels
+    seconds: float = 0.0  # its processing time
+    age_s: float = 0.0  # time from its arrival until it was mapped, including its wait in the queue
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerStatus:
     """Totals since the start of the agent.
 
-    busy_s: time of perception and mapping. under_trained, publishing_skipped, seeding_skipped: frames whose time was
-    too short for all of it. max_detection_lag: longest delay of a detection, in frames. keyframes_reevaluated:
-    keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
-    latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
-    notes: messages of the relevance estimator. objects: the confirmed objects of the task. nouns: what is searched for
-    each noun, and what was detected. team_gaussians: Gaussians inserted from the fused map. localisation: of the robot.
+    under_trained, publishing_skipped, seeding_skipped: frames whose time was too short for all of it. correction: the
+    odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
     """
 
-    graph: TaskGraph | None = None
-    map_revision: int = 0
-    gaussians: int = 0
+    graph: TaskGraph | None = None  # of the current task
+    map_revision: int = 0  # grows with each change of the map
+    gaussians: int = 0  # in the map
     mapped: int = 0
-    skipped: int = 0
-    dropped: int = 0
-    rejected: int = 0
+    skipped: int = 0  # frames with a defect or without a place
+    dropped: int = 0  # frames that newer ones replaced in the queue
+    rejected: int = 0  # invalid frames
     iterations: int = 0
-    busy_s: float = 0.0
-    roi_share_sum: float = 0.0
-    idle_iterations: int = 0
+    busy_s: float = 0.0  # time of perception and mapping
+    roi_share_sum: float = 0.0  # over the mapped frames; divided by their number, the mean
+    idle_iterations: int = 0  # iterations while no frame waited
     under_trained: int = 0
     publishing_skipped: int = 0
     seeding_skipped: int = 0
-    max_detection_lag: int = 0
-    keyframes_reevaluated: int = 0
-    publish_error: str = ""
-    ages_s: tuple[float, ...] = ()
-    notes: tuple[str, ...] = ()
+    max_detection_lag: int = 0  # longest delay of a detection, in frames
+    keyframes_reevaluated: int = 0  # keyframes evaluated for a new task
+    publish_error: str = ""  # why the uplink refused the newest changes
+    ages_s: tuple[float, ...] = ()  # ages of the latest mapped frames
+    notes: tuple[str, ...] = ()  # messages of the relevance estimator
     correction: PoseCorrection | None = None
     corrected_at_s: float = 0.0
-    objects: tuple[ObjectLandmark, ...] = ()
-    nouns: tuple[NounReport, ...] = ()
-    team_gaussians: int = 0
-    localisation: LocalisationState = LocalisationState.TRACKED
+    objects: tuple[ObjectLandmark, ...] = ()  # the confirmed objects of the task
+    nouns: tuple[NounReport, ...] = ()  # what is searched for each noun, and what was detected
+    team_gaussians: int = 0  # Gaussians inserted from the fused map
+    localisation: LocalisationState = LocalisationState.TRACKED  # of the robot
 
     @property
     def noun_notes(self) -> tuple[str, ...]:

@@ -30,6 +30,19 @@ from gausslite.wire.map_changes import read_deadline
 from gausslite.wire.security import Caller
 
 _MAX_SELECTED_KEYFRAMES = 10_000
+_CHUNK_BYTES = 1 << 20
+_STATES = {
+    state: pb.AlignmentState.Value(f"ALIGNMENT_STATE_{state.name.replace('UNKNOWN', 'UNSPECIFIED')}")
+    for state in AlignmentState
+}
+_LAYERS: dict[int, MapLayer] = {
+    0: MapLayer.VOTE,
+    **{pb.MapLayer.Value(f"MAP_LAYER_{layer.name}"): layer for layer in MapLayer},
+}
+_CONTRIBUTION = (
+    *("agent_id", "joined", "last_update_seq", "keyframes", "targets"),
+    *("voxels", "gaussians", "kappa_sum", "won_voxels"),
+)
 
 
 def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> SessionRecord:
@@ -92,9 +105,6 @@ def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> Voxel
             raise InvalidInputError(f"strategy: expected VOTE, CONCATENATION or REFINED, got {other}")
 
 
-_CHUNK_BYTES = 1 << 20
-
-
 class ExportedFile:
     """A file that is sent, as a copy on the disk: a slow reader must not hold it in memory."""
 
@@ -131,16 +141,6 @@ def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.Ge
         t_world_camera=convert.transform_to_message(in_fused_frame[0].frame.T_world_camera) if in_fused_frame else None,
         indices=indices,
     )
-
-
-_STATES = {
-    state: pb.AlignmentState.Value(f"ALIGNMENT_STATE_{state.name.replace('UNKNOWN', 'UNSPECIFIED')}")
-    for state in AlignmentState
-}
-_LAYERS: dict[int, MapLayer] = {
-    0: MapLayer.VOTE,
-    **{pb.MapLayer.Value(f"MAP_LAYER_{layer.name}"): layer for layer in MapLayer},
-}
 
 
 def layer_from_message(number: int) -> MapLayer:
@@ -189,12 +189,6 @@ def alignment_to_message(alignment: FrameAlignment) -> pb.FrameAlignment:
         message.colour_before, message.colour_after = fit.before.colour, fit.after.colour
         message.compared = fit.compared
     return message
-
-
-_CONTRIBUTION = (
-    *("agent_id", "joined", "last_update_seq", "keyframes", "targets"),
-    *("voxels", "gaussians", "kappa_sum", "won_voxels"),
-)
 
 
 def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:

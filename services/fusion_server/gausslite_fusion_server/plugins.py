@@ -22,6 +22,8 @@ from gausslite.render.rasterizer import Rendering
 from gausslite.wire.server import Service
 from gausslite_fusion_server.settings import ServerSettings
 
+FindEngine = Callable[[], FusionEngine]
+
 
 class MessageCounts(NamedTuple):
     """Of a server that shares a mission: messages of agents, parts sent to owners and stored as one, and parts refused
@@ -34,7 +36,6 @@ class MessageCounts(NamedTuple):
     foreign: int
 
 
-FindEngine = Callable[[], FusionEngine]
 FindCounts = Callable[[], MessageCounts]
 MetricsServer = Callable[[str, FindEngine, Acknowledgements, FindCounts | None], AbstractContextManager[int]]
 """A plug-in of the group gausslite.metrics: serves the figures of a server at HOST:PORT; gives the actual port.

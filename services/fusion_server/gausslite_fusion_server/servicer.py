@@ -33,6 +33,18 @@ from gausslite_fusion_server.plugins import MapRenderer, OpenRefiner, OpenRender
 from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
 _Message = TypeVar("_Message")
+_log = logging.getLogger(__name__)
+MAX_REPORTED_REJECTIONS = 1000
+_WORKERS, _MAX_WAITING = 4, 1024
+_KEYFRAME_PAUSE = 2.0
+_ALIGN_DELAY_S = 0.1
+"""The messages of this time share one look at which frames are due."""
+_ALIGN_PAUSE = 4.0
+"""Shortest pause after a comparison of an agent, in its durations: all together take a fifth of a core at most."""
+_ALIGN_RETRY_S = 30.0
+_SLICE_PAUSE = 4.0
+"""Pause after a slice of background work, in its durations."""
+_Result = TypeVar("_Result")
 
 
 class DrainGate:
@@ -81,21 +93,6 @@ async def _next(requests: AsyncIterator[_Message]) -> _Message | None:
 
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
-
-
-_log = logging.getLogger(__name__)
-MAX_REPORTED_REJECTIONS = 1000
-_WORKERS, _MAX_WAITING = 4, 1024
-_KEYFRAME_PAUSE = 2.0
-_ALIGN_DELAY_S = 0.1
-"""The messages of this time share one look at which frames are due."""
-_ALIGN_PAUSE = 4.0
-"""Shortest pause after a comparison of an agent, in its durations: all together take a fifth of a core at most."""
-_ALIGN_RETRY_S = 30.0
-_SLICE_PAUSE = 4.0
-"""Pause after a slice of background work, in its durations."""
-
-_Result = TypeVar("_Result")
 
 
 class FusionServicer(pb_grpc.FusionServiceServicer):

@@ -53,15 +53,12 @@ def watched_part(request: pb.WatchFusedMapRequest) -> WatchedPart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedMapReader:
-    """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers.
-
-    since_revision: where the watcher begins; from there it gets all changes as one.
-    """
+    """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers."""
 
     engine: FusionEngine
     watched: WatchedPart
     cache: EncodedPartCache
-    since_revision: int = 0
+    since_revision: int = 0  # where the watcher begins; from there it gets all changes as one
 
     def snapshot(self) -> tuple[int, Parts]:
         """Return the current revision and the tiles of the layer, each as it is when it is read."""

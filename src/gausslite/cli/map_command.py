@@ -61,6 +61,17 @@ from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, DeferredInterrupt
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.channel import MAX_PORT
 
+_SKIPS = {
+    NO_DEPTH: "without depth",
+    ONE_COLOUR: "of one colour",
+    TOO_FAR: "too far",
+    REPEATED: "repeated",
+    TRACKING_LOST: "lost by tracking",
+    UNPLACED: "without a known place",
+}
+_LEAST_DEPTH_M = 0.05
+"""No depth camera measures nearer: a smaller median is in another unit."""
+
 
 def trajectory_report(mapped: MappedRun, evaluator: Evaluator | None) -> dict[str, object]:
     """Return the ATE of the map's trajectory and of the given one, if true poses exist, and the tracking counts.
@@ -89,16 +100,6 @@ def tracking_text(report: Mapping[str, Any]) -> str:
     if ate is None:
         return f"tracking (frames): {counts}; the sequence has no poses to compare with"
     return f"tracking (frames): {counts}; ATE {1e3 * ate['rmse_m']:.1f} mm RMSE over {ate['poses']} poses"
-
-
-_SKIPS = {
-    NO_DEPTH: "without depth",
-    ONE_COLOUR: "of one colour",
-    TOO_FAR: "too far",
-    REPEATED: "repeated",
-    TRACKING_LOST: "lost by tracking",
-    UNPLACED: "without a known place",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,10 +386,6 @@ def _evaluator() -> tuple[Evaluator | None, tuple[str, ...]]:
     except MissingPluginError as error:
         return None, (str(error),)
     return evaluator, ()
-
-
-_LEAST_DEPTH_M = 0.05
-"""No depth camera measures nearer: a smaller median is in another unit."""
 
 
 def require_mappable_depth(mapped: MappedRun) -> None:

@@ -34,6 +34,12 @@ _LABEL_BYTES = 4 + 2 + 1
 """Of one Gaussian's kappa, target and active flag."""
 _MAX_ABS_VALUE = 1e6
 _MIN_LARGEST_COMPONENT = 1e-6
+_SYMBOL_BYTES = 1 + 3 + 1 + 3 + 1 + 3
+_MAX_BIT_FIELD_BYTES = (3 * columns.MAX_FINE_BITS + 7) // 8
+_QUANTISED_BYTES = _SYMBOL_BYTES + _MAX_BIT_FIELD_BYTES + _LABEL_BYTES
+_FRAME_SIZE = struct.Struct("<I")
+_WIDTHS = {"means_m": 3, "quats_wxyz": 4, "scales_m": 3, "opacities": 1, "rgb": 3}
+_LOSSLESS_BYTES = 4 * sum(_WIDTHS.values()) + _LABEL_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,12 +152,6 @@ def _sums(kappa: NDArray[np.uint32], offsets: Int64[ndarray, " v1"]) -> NDArray[
     return np.asarray(totals[offsets[1:]] - totals[offsets[:-1]])
 
 
-_SYMBOL_BYTES = 1 + 3 + 1 + 3 + 1 + 3
-_MAX_BIT_FIELD_BYTES = (3 * columns.MAX_FINE_BITS + 7) // 8
-_QUANTISED_BYTES = _SYMBOL_BYTES + _MAX_BIT_FIELD_BYTES + _LABEL_BYTES
-_FRAME_SIZE = struct.Struct("<I")
-
-
 def encode_quantised(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     """Return the body. Raises InvalidInputError if a mean lies outside its voxel."""
     coarse_bits = layout.precision.coarse_bits
@@ -215,10 +215,6 @@ def _split(body: bytes) -> tuple[bytes, bytes]:
     if end > len(body):
         raise CodecError(f"subset: expected a frame of at most {len(body) - _FRAME_SIZE.size} bytes, got a longer one")
     return body[_FRAME_SIZE.size : end], body[end:]
-
-
-_WIDTHS = {"means_m": 3, "quats_wxyz": 4, "scales_m": 3, "opacities": 1, "rgb": 3}
-_LOSSLESS_BYTES = 4 * sum(_WIDTHS.values()) + _LABEL_BYTES
 
 
 def _encode_lossless(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:

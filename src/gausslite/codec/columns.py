@@ -31,16 +31,38 @@ from numpy.typing import NDArray
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
 
+_ZSTD_LEVEL = 3
+_MIN_WINDOW_BYTES = 1 << 10
+SCALE_STEPS_PER_OCTAVE = 7
+SCALE_MIN_EXPONENT = -20
+SCALE_MIN_M = 2.0**SCALE_MIN_EXPONENT
+SCALE_MAX_M = 2.0 ** (SCALE_MIN_EXPONENT + 255 / SCALE_STEPS_PER_OCTAVE)
+RGB_MIN, RGB_MAX = -0.5, 1.5
+OPACITY_BINS = 64
+QUAT_ZERO = 128
+MAX_QUAT_STEPS = 127
+_LUMA_STEPS, _CHROMA_STEPS, _MAX_COLOUR_CODE = 64, 32, 128
+_LUMA_MIN, _CHROMA_MIN = RGB_MIN, RGB_MIN - RGB_MAX
+_QUAT_PRECISION = 8.0
+# the three encoded components, for each index of the largest one
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_SCALES_M = np.exp2(SCALE_MIN_EXPONENT + np.arange(256) / SCALE_STEPS_PER_OCTAVE).astype(np.float32)
+_RATIOS = 2.0 ** (np.arange(256) / SCALE_STEPS_PER_OCTAVE)
+_STEPS_BY_SPREAD = np.minimum(np.ceil(_QUAT_PRECISION / 2 * (_RATIOS - 1 / _RATIOS)), MAX_QUAT_STEPS).astype(np.int64)
+QUAT_STEPS = _STEPS_BY_SPREAD.astype(np.uint8).tobytes()
+"""The steps by the difference between the largest and the smallest code of a scale, a byte each."""
+MAX_FINE_BITS = 15
+MIN_COARSE_BITS, MAX_COARSE_BITS = 2, 5
+_CELL_SHARE = 0.5
+# the centre of a cell of MAX_FINE_BITS is an odd number of these parts
+_FRACTIONS = 1 << (MAX_FINE_BITS + 1)
+
 
 def pack_bits(values: Int64[ndarray, " n"], widths: Int64[ndarray, " n"]) -> bytes:
     """Return the low widths[i] bits of values[i], one value after the other; the last byte is filled with zeros."""
     bit_indices = np.arange(int(widths.max(initial=0)))
     bits = (values[:, None] >> bit_indices & 1).astype(np.uint8)
     return np.packbits(bits[bit_indices < widths[:, None]], bitorder="little").tobytes()
-
-
-_ZSTD_LEVEL = 3
-_MIN_WINDOW_BYTES = 1 << 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,22 +118,6 @@ def _unshuffle(raw: bytes, column: Column) -> NDArray[Any]:
     return np.ascontiguousarray(planes.T).reshape(-1).view(column.dtype).reshape(column.shape)
 
 
-SCALE_STEPS_PER_OCTAVE = 7
-SCALE_MIN_EXPONENT = -20
-SCALE_MIN_M = 2.0**SCALE_MIN_EXPONENT
-SCALE_MAX_M = 2.0 ** (SCALE_MIN_EXPONENT + 255 / SCALE_STEPS_PER_OCTAVE)
-RGB_MIN, RGB_MAX = -0.5, 1.5
-OPACITY_BINS = 64
-QUAT_ZERO = 128
-MAX_QUAT_STEPS = 127
-
-_LUMA_STEPS, _CHROMA_STEPS, _MAX_COLOUR_CODE = 64, 32, 128
-_LUMA_MIN, _CHROMA_MIN = RGB_MIN, RGB_MIN - RGB_MAX
-_QUAT_PRECISION = 8.0
-# the three encoded components, for each index of the largest one
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-
-
 def encode_scales(scales_m: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
     """Encode scales on a logarithmic grid, clamped to SCALE_MIN_M and SCALE_MAX_M."""
     octaves = np.log2(np.clip(scales_m.astype(np.float64), SCALE_MIN_M, SCALE_MAX_M)) - SCALE_MIN_EXPONENT
@@ -123,9 +129,6 @@ def decode_scales(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
     return np.asarray(_SCALES_M[codes])
 
 
-_SCALES_M = np.exp2(SCALE_MIN_EXPONENT + np.arange(256) / SCALE_STEPS_PER_OCTAVE).astype(np.float32)
-
-
 def quat_steps(scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
     """Return the steps of a quaternion's components: a long Gaussian needs more than a round one, which needs none.
 
@@ -135,12 +138,6 @@ def quat_steps(scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
     # NumPy reduces three long rows much faster than many short ones
     axes = np.ascontiguousarray(scale_codes.T)
     return np.asarray(_STEPS_BY_SPREAD[axes.max(axis=0) - axes.min(axis=0)])
-
-
-_RATIOS = 2.0 ** (np.arange(256) / SCALE_STEPS_PER_OCTAVE)
-_STEPS_BY_SPREAD = np.minimum(np.ceil(_QUAT_PRECISION / 2 * (_RATIOS - 1 / _RATIOS)), MAX_QUAT_STEPS).astype(np.int64)
-QUAT_STEPS = _STEPS_BY_SPREAD.astype(np.uint8).tobytes()
-"""The steps by the difference between the largest and the smallest code of a scale, a byte each."""
 
 
 def encode_quats(
@@ -198,13 +195,6 @@ def decode_rgb(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
     middle = luma - lime / 2
     blue = middle - orange / 2
     return np.stack([blue + orange, middle + lime, blue], axis=1).astype(np.float32)
-
-
-MAX_FINE_BITS = 15
-MIN_COARSE_BITS, MAX_COARSE_BITS = 2, 5
-_CELL_SHARE = 0.5
-# the centre of a cell of MAX_FINE_BITS is an odd number of these parts
-_FRACTIONS = 1 << (MAX_FINE_BITS + 1)
 
 
 class PositionPrecision(NamedTuple):

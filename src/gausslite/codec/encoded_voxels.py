@@ -61,11 +61,10 @@ _HEAD = struct.Struct("<dI")
 class EncodedVoxels:
     """The complete content of each listed voxel, as a row has it.
 
-    voxels: a VOXELS element each. gaussians: sorted by voxel, CODES of messages with voxels of size_m metres, or
-    RECORDs, and then size_m is 0.
+    gaussians: sorted by voxel, CODES of messages with voxels of size_m metres, or RECORDs, and then size_m is 0.
     """
 
-    voxels: NDArray[Any]
+    voxels: NDArray[Any]  # a VOXELS element each
     gaussians: NDArray[Any]
     size_m: float
 
@@ -188,7 +187,7 @@ class EncodedSubset:
     """One message of an agent, see RoiSubset, as a store keeps it."""
 
     agent_id: str
-    message_seq: int
+    message_seq: int  # see RoiSubset
     update_seq: int
     voxels: EncodedVoxels
 

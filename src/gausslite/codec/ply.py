@@ -58,16 +58,16 @@ _PRINTABLE = "".join(chr(code) for code in range(0x20, 0x7F) if chr(code) != "%"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
-    """The content of a PLY file. left_out: how many rows are left out, and why in words; empty for a whole file.
+    """The content of a PLY file.
 
     harmonics: coefficients of the spherical harmonics above degree 0 for each channel; k is 0, 3, 8 or 15.
     """
 
     gaussians: Gaussians
-    world_frame: str
+    world_frame: str  # empty for an unnamed one
     harmonics: Float32[ndarray, "n 3 k"]
-    left_out: int = 0
-    reason: str = ""
+    left_out: int = 0  # how many rows are left out, and why in words; empty for a whole file
+    reason: str = ""  # why they are left out, in words
 
 
 def write_ply(
@@ -200,12 +200,12 @@ def _to_gaussians(raw: Mapping[str, NDArray[Any]], count: int) -> Gaussians:
 
 @dataclass(frozen=True, slots=True)
 class _Element:
-    """An element of the header; fields: type of each column by its name. has_list: its rows differ in size."""
+    """An element of the header."""
 
     name: str
     count: int
-    fields: dict[str, str]
-    has_list: bool = False
+    fields: dict[str, str]  # type of each column by its name
+    has_list: bool = False  # its rows differ in size
 
 
 def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:

@@ -27,7 +27,7 @@ class KeyframeView:
     capture_time_ns: int
     camera: Camera
     T_world_camera: Float64[ndarray, "4 4"]
-    roi_pixels: int
+    roi_pixels: int  # size of the region in the image
 
 
 def write_keyframe_views(folder: Path, views: Sequence[KeyframeView]) -> None:

@@ -25,6 +25,12 @@ from safetensors.numpy import save_file
 from gausslite.domain.errors import MapFileError, StorageError
 from gausslite.domain.state import State
 
+FORMAT = "gausslite-state"
+VERSION = "2"
+_TYPES = {"BOOL", "U8", "I16", "I32", "U32", "I64", "U64", "F32", "F64"}
+_LENGTH_BYTES = 8
+_MAX_HEADER_BYTES = 1 << 24
+
 
 def write_atomic(path: Path, data: bytes) -> None:
     """Write the bytes to a temporary file in the same folder, then rename it to `path`.
@@ -93,13 +99,6 @@ def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
 
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     write_atomic(path, encoded.tobytes())
-
-
-FORMAT = "gausslite-state"
-VERSION = "2"
-_TYPES = {"BOOL", "U8", "I16", "I32", "U32", "I64", "U64", "F32", "F64"}
-_LENGTH_BYTES = 8
-_MAX_HEADER_BYTES = 1 << 24
 
 
 def write_state(path: Path, state: State, mode: int = 0o644) -> None:

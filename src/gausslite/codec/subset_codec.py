@@ -35,6 +35,11 @@ _HEADER = struct.Struct("<4sHBBBBBIIIdQQBB")
 _TRAILER = struct.Struct("<I")
 _MAX_NAME_BYTES = 255
 _FRAME_BYTES = 256
+_Header = namedtuple(
+    "_Header",
+    "magic version coding kappa_bytes target_bytes coarse_bits scale_code voxels gaussians body_bytes size_m "
+    "message_seq update_seq agent_bytes session_bytes",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +52,6 @@ class CodecLimits:
 
 
 DEFAULT_LIMITS = CodecLimits()
-
-
-_Header = namedtuple(
-    "_Header",
-    "magic version coding kappa_bytes target_bytes coarse_bits scale_code voxels gaussians body_bytes size_m "
-    "message_seq update_seq agent_bytes session_bytes",
-)
 
 
 def encode_subset(subset: RoiSubset, grid: VoxelGrid, coding: SubsetCoding = SubsetCoding.QUANTISED) -> bytes:

@@ -16,33 +16,31 @@ from gausslite.domain.checks import require_instance
 
 _OPTION = "option"
 Settings = TypeVar("Settings")
+_MIN_SIMILARITY = 0.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
     """What is declared of an option beside the name, type and default of its field.
 
-    key: its name in files; by default the field's, with dashes. low, high: bounds of a number, both included; unit: its
-    unit. choices: the accepted texts. needs: the option without which this one has no effect, as "detector", or with
-    the value that it must have, as "backend=onnx|http". excludes: the option that this one replaces.
-    computed: returns the value that is used if none is set. repeats: a list whose parts may
-    contain commas; its flag may be repeated.
+    low, high: bounds of a number, both included; needs: the option without which this one has no effect, as "detector",
+    or with the value that it must have, as "backend=onnx|http".
 
     plain_type: the type in files and flags, if it is not the field's; convert returns the field's value from it, and
     to_plain the reverse.
     """
 
     help: str
-    key: str = ""
+    key: str = ""  # its name in files; by default the field's, with dashes
     metavar: str = ""
-    unit: str = ""
+    unit: str = ""  # its unit
     low: float | None = None
     high: float | None = None
-    choices: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()  # the accepted texts
     needs: str = ""
-    excludes: str = ""
-    computed: Callable[[Namespace], Any] | None = None
-    repeats: bool = False
+    excludes: str = ""  # the option that this one replaces
+    computed: Callable[[Namespace], Any] | None = None  # returns the value that is used if none is set
+    repeats: bool = False  # a list whose parts may contain commas; its flag may be repeated
     plain_type: Any = None
     convert: Callable[[Any], Any] | None = None
     to_plain: Callable[[Any], Any] | None = None
@@ -55,12 +53,12 @@ def option(default: Any, help_text: str, *, metadata: Mapping[str, Any] | None =
 
 @dataclass(frozen=True, slots=True)
 class OptionField:
-    """An option with its field. plain_type: the type in files and flags, without None."""
+    """An option with its field."""
 
     key: str
     field_name: str
-    field_type: Any
-    plain_type: Any
+    field_type: Any  # as the class declares it
+    plain_type: Any  # the type in files and flags, without None
     default: Any
     option: Option
 
@@ -165,9 +163,6 @@ def _without_none(kind: Any) -> Any:
         kinds = [part for part in get_args(kind) if part is not type(None)]
         return kinds[0] if len(kinds) == 1 else kind
     return kind
-
-
-_MIN_SIMILARITY = 0.75
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

@@ -32,15 +32,16 @@ _CONFIG_HELP = (
     "read options from this file, and from variables such as GAUSSLITE_MAX_GAUSSIANS; variables override the file, "
     "flags override both"
 )
+_OWN_NAMES = frozenset({"config", "set", "print_config", PROGRAM, PARSER})
 
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """A value that a layer sets, and how messages name it. is_toml: the value has a type of TOML."""
+    """A value that a layer sets, and how messages name it."""
 
     value: Any
     origin: str
-    is_toml: bool = False
+    is_toml: bool = False  # the value has a type of TOML
 
 
 _Layer = Mapping[str, _Given]
@@ -48,14 +49,11 @@ _Layer = Mapping[str, _Given]
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """The options of a program or command, by key.
-
-    flags: keys of the options that are also flags, in the order of the help; positional: those without dashes.
-    """
+    """The options of a program or command, by key."""
 
     options: Mapping[str, OptionField]
-    flags: tuple[str, ...] = ()
-    positional: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()  # keys of the options that are also flags, in the order of the help
+    positional: tuple[str, ...] = ()  # those without dashes
 
     @classmethod
     def of(
@@ -271,9 +269,6 @@ class Program:
             shown = _placeholder(declared, quoted=True) if computed is None else to_toml({"": as_plain(computed)})[3:]
             lines.append(f"# {key} = {shown}".rstrip())
         return "\n".join(lines) + "\n"
-
-
-_OWN_NAMES = frozenset({"config", "set", "print_config", PROGRAM, PARSER})
 
 
 def parse_options(

@@ -19,17 +19,15 @@ from gausslite.plugins import Group, load
 class StatedValues:
     """What the user states of a recording; None leaves a value to the source's guarantee or to an estimate.
 
-    depth_as_recorded: depth is used without registration. lens: kept where the camera is estimated, in place of the
-    lens that the source's files state. force: poses and depth are used although they contradict the images. checked:
-    they are not compared with the images, because that was done before, or because given poses are not used.
+    checked: they are not compared with the images, because that was done before, or because given poses are not used.
     """
 
     registration: DepthRegistration | None = None
-    depth_as_recorded: bool = False
+    depth_as_recorded: bool = False  # depth is used without registration
     correction: CameraCorrection | None = None
-    lens: Lens | None = None
+    lens: Lens | None = None  # kept where the camera is estimated, in place of the lens that the source's files state
     pose_prior: PoseExposurePrior | None = None
-    force: bool = False
+    force: bool = False  # poses and depth are used although they contradict the images
     checked: bool = False
 
     @classmethod
@@ -51,16 +49,12 @@ class StatedValues:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Why a value that the user did not state was chosen.
+    """Why a value that the user did not state was chosen."""
 
-    option: name of the option that states it. value: as the option reads it. guaranteed: by the source; False for an
-    estimate.
-    """
-
-    option: str
-    value: str
-    reasons: tuple[str, ...]
-    guaranteed: bool = False
+    option: str  # name of the option that states it
+    value: str  # as the option reads it
+    reasons: tuple[str, ...]  # the lines that a user reads
+    guaranteed: bool = False  # by the source; False for an estimate
 
     def __str__(self) -> str:
         """Return option, value and reasons as one line."""
@@ -69,18 +63,14 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A source with registered depth and corrected images, what was applied to it, and the errors of its poses.
-
-    registration: None if depth is used as recorded. correction: the identity if images are. evidence: of each value
-    that the user did not state. notes: on poses or depth that contradict the images, and on values that nobody states.
-    """
+    """A source with registered depth and corrected images, what was applied to it, and the errors of its poses."""
 
     source: Source
-    registration: DepthRegistration | None
-    correction: CameraCorrection
+    registration: DepthRegistration | None  # None if depth is used as recorded
+    correction: CameraCorrection  # the identity if images are
     pose_prior: PoseExposurePrior
-    evidence: tuple[Evidence, ...] = ()
-    notes: tuple[str, ...] = ()
+    evidence: tuple[Evidence, ...] = ()  # of each value that the user did not state
+    notes: tuple[str, ...] = ()  # on poses or depth that contradict the images, and on values that nobody states
 
 
 class Calibrator(Protocol):

@@ -21,6 +21,15 @@ CAMERA_FILE = "cam_params.json"
 CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
 _MIN_UNITS_PER_METRE = 0.1
 """Smaller values are metres per unit, the reciprocal."""
+_LENS_MODELS = {
+    **dict.fromkeys(("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "opencv"), LensModel.RADTAN),
+    **dict.fromkeys(("brownconrady", "modifiedbrownconrady", "inversebrownconrady"), LensModel.RADTAN),
+    **dict.fromkeys(("equidistant", "fisheye", "opencvfisheye", "kb4"), LensModel.FISHEYE),
+    **dict.fromkeys(("kannalabrandt", "kannalabrandt4", "kannalabrandt8"), LensModel.FISHEYE),
+}
+"""Names of ROS, Kalibr, OpenCV, ORB-SLAM, Basalt and the RealSense SDK, in lower case, without marks between words."""
+_WITHOUT_LENS = ("", "none", "pinhole", "ideal", "undistorted", "rectified")
+_MAX_COEFFICIENTS = {LensModel.RADTAN: 8, LensModel.FISHEYE: 4}
 
 
 def example_camera_file(width_px: int, height_px: int) -> str:
@@ -36,17 +45,13 @@ def find_in_or_above(folder: Path, name: str) -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class FolderCamera:
-    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none.
-
-    note: message that names a file of another folder; empty if the camera's file is the recording's own.
-    depth_registered: whether each depth pixel belongs to the colour pixel at its place, None if it is not stated.
-    """
+    """Camera that a folder's files state."""
 
     camera: Camera
-    units_per_metre: float | None = None
+    units_per_metre: float | None = None  # of the depth images, None if the file states none
     lens: Lens | None = None
-    note: str = ""
-    depth_registered: bool | None = None
+    note: str = ""  # message that names a file of another folder; empty if the camera's file is the recording's own
+    depth_registered: bool | None = None  # whether each depth pixel belongs to the colour pixel at its place
 
 
 class CameraReader(Protocol):
@@ -162,17 +167,6 @@ def read_camera_info(path: Path) -> FolderCamera:
         reason = " ".join(str(error).split())[:120]
         raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {reason}") from None
     return FolderCamera(intrinsics.camera(str(path), width, height), lens=lens)
-
-
-_LENS_MODELS = {
-    **dict.fromkeys(("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "opencv"), LensModel.RADTAN),
-    **dict.fromkeys(("brownconrady", "modifiedbrownconrady", "inversebrownconrady"), LensModel.RADTAN),
-    **dict.fromkeys(("equidistant", "fisheye", "opencvfisheye", "kb4"), LensModel.FISHEYE),
-    **dict.fromkeys(("kannalabrandt", "kannalabrandt4", "kannalabrandt8"), LensModel.FISHEYE),
-}
-"""Names of ROS, Kalibr, OpenCV, ORB-SLAM, Basalt and the RealSense SDK, in lower case, without marks between words."""
-_WITHOUT_LENS = ("", "none", "pinhole", "ideal", "undistorted", "rectified")
-_MAX_COEFFICIENTS = {LensModel.RADTAN: 8, LensModel.FISHEYE: 4}
 
 
 def lens_of(location: str, model: str, coefficients: Iterable[float]) -> Lens | None:

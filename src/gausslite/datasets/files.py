@@ -29,23 +29,28 @@ _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\x01\xd0-\xd7])", re.DOTALL)
 _JPEG_START, _JPEG_END = b"\xd8", b"\xd9"
 _SATURATED = np.iinfo(np.uint16).max
 _MAX_OF_12_BITS, _WHOLE_RANGE = (1 << 12) - 1, 1 << 16
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_NOT_A_NUMBER = re.compile(r"[-+]?(?:nan\(.*\)|1\.#(?:QNAN|SNAN|IND)\w*)|NA", re.IGNORECASE)
+"""NaN as the C library of Windows and tables of R write it."""
+_SEPARATORS, _OTHER_SEPARATORS = re.compile(r"[\s,;\"']+"), re.compile(r"[\s;\"']+")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+|[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
 class DepthUnits:
     """Units per metre of a depth image."""
 
-    per_metre: float
+    per_metre: float  # 1000 for millimetres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdImage:
-    """A colour and a depth image of one size, with their camera; recorded_rgb: as in Frame."""
+    """A colour and a depth image of one size, with their camera."""
 
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
     camera: Camera
-    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
+    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None  # as in Frame
 
     def frame(self, number: int, time_ns: int, T_world_camera: Float64[ndarray, "4 4"]) -> Frame:
         """Return the frame of these images. Raises PoseError, InvalidInputError."""
@@ -228,13 +233,6 @@ def require_pixel_count(location: str, width_px: int, height_px: int) -> None:
 
 def _size(image: NDArray[Any]) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
-
-
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_NOT_A_NUMBER = re.compile(r"[-+]?(?:nan\(.*\)|1\.#(?:QNAN|SNAN|IND)\w*)|NA", re.IGNORECASE)
-"""NaN as the C library of Windows and tables of R write it."""
-_SEPARATORS, _OTHER_SEPARATORS = re.compile(r"[\s,;\"']+"), re.compile(r"[\s;\"']+")
-_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+|[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 
 def read_text(path: Path) -> str:

@@ -25,6 +25,15 @@ from gausslite.domain.relevance import Region
 _REPAIRABLE_DEVIATION = 0.05
 FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 """Upward direction of a world that a level first view defines."""
+_LEVEL_COSINE = 0.8
+"""Cameras without roll show up within about 20 degrees; rarely level ones within 37."""
+_ORIGIN_STEP_M = 10_000.0
+_EARTH_DIAMETER_M = 1.3e7
+_MEANING = "time tx ty tz qx qy qz qw"
+MAX_POSE_GAP_S = 1.0
+"""Longest time between two poses to interpolate: slow localisation nodes publish map → odom once a second."""
+_ROUNDING_S = 1e-6
+"""Times are written in microseconds: a limit that they meet exactly is not exceeded."""
 
 
 def is_lost(translation_m: Float64[ndarray, "3"], rotation: Float64[ndarray, "..."]) -> bool:
@@ -108,10 +117,6 @@ def estimate_up(
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
-_LEVEL_COSINE = 0.8
-"""Cameras without roll show up within about 20 degrees; rarely level ones within 37."""
-
-
 def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) -> str:
     """Return the message on images that show another upward direction than this one; empty if they agree."""
     shown = np.array(estimate_up(rotations_world_camera, up_axis))
@@ -119,10 +124,6 @@ def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) 
         return ""
     stated, found = (",".join(f"{value + 0.0:.2g}" for value in np.round(axis, 2)) for axis in (up_axis, shown))
     return f"the images show up as {found}, the layout as {stated}; 'on', heights and grids need it: state up={found}"
-
-
-_ORIGIN_STEP_M = 10_000.0
-_EARTH_DIAMETER_M = 1.3e7
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,8 +269,8 @@ class FolderReader:
     """A SourceReader for a class of sequences in folders or files."""
 
     sources: FolderSourceClass
-    layout: str
-    address: str = ""
+    layout: str  # the names of its files, for messages
+    address: str = ""  # what it opens that is no folder, for messages
 
     def recognises(self, address: str) -> bool:
         """True if the path has this layout."""
@@ -278,9 +279,6 @@ class FolderReader:
     def open(self, address: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
         """Return the sequence at the path. Raises DatasetError, PoseError."""
         return self.sources(Path(address).expanduser(), up_axis, require_poses)
-
-
-_MEANING = "time tx ty tz qx qy qz qw"
 
 
 def format_pose_rows(title: str, times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"]) -> str:
@@ -315,12 +313,6 @@ def quat_xyzw(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
     return np.append(0.5 * np.sinc(half / np.pi) * rotation_rad, np.cos(half))
 
 
-MAX_POSE_GAP_S = 1.0
-"""Longest time between two poses to interpolate: slow localisation nodes publish map → odom once a second."""
-_ROUNDING_S = 1e-6
-"""Times are written in microseconds: a limit that they meet exactly is not exceeded."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTrack:
     """Poses T_parent_child at ascending times, with quaternions of about unit length in the order x y z w.
@@ -331,7 +323,7 @@ class PoseTrack:
     """
 
     location: str
-    times_s: Float64[ndarray, " n"]
+    times_s: Float64[ndarray, " n"]  # ascending
     translations_m: Float64[ndarray, "n 3"]
     quats_xyzw: Float64[ndarray, "n 4"]
     max_gap_s: float

@@ -18,6 +18,7 @@ from gausslite.domain.pose import Trajectory, UpAxis
 from gausslite.domain.relevance import Region
 
 Item = TypeVar("Item")
+_DOWNSCALED_PIXELS = 320 * 240
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,9 +221,6 @@ def usable_frames(
             frame = source.frame(position, size)
             if not frame.defect:
                 yield position, frame
-
-
-_DOWNSCALED_PIXELS = 320 * 240
 
 
 def select_frames(source: Source, selection: str) -> list[int]:

@@ -26,16 +26,21 @@ _MAX_FOCAL_PX = 1e6
 """Larger focal lengths overflow float32 in products with pixels; real cameras have a hundredth of it."""
 _MAX_SLOPE = 100.0
 """Largest tangent of a ray's angle to the optical axis (89.4 degrees); steeper rays are not a pinhole camera."""
+MAX_READOUT_S = 0.1
+MAX_EXPOSURE_S = 0.1
+_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
+"""Limits as in the rasterizer."""
+_MAX_COEFFICIENT = 1e3
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Intrinsics in pixels; the image plane's origin is the top-left corner of the top-left pixel."""
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
+    fx_px: float  # focal length in image columns
+    fy_px: float  # focal length in image rows
+    cx_px: float  # column of the principal point; the first pixel's centre is at 0.5
+    cy_px: float  # its row
     width_px: int
     height_px: int
 
@@ -201,12 +206,6 @@ def project(points_camera: Float32[ndarray, "n 3"], camera: Camera) -> Float32[n
     return np.stack([columns, rows], axis=1).astype(np.float32)
 
 
-MAX_READOUT_S = 0.1
-MAX_EXPOSURE_S = 0.1
-_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
-"""Limits as in the rasterizer."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
     """How a camera moves while its rows are exposed, one after the other from the first to the last.
@@ -269,13 +268,6 @@ class CameraMotion:
         """True if the image is that of a camera at rest: no velocity, or neither readout nor exposure time."""
         moves = bool(self.twist.linear_m_s.any() or self.twist.angular_rad_s.any())
         return not moves or (self.readout_s == 0.0 and self.exposure_s == 0.0)
-
-
-_MAX_COEFFICIENT = 1e3
-_NEWTON_STEPS = 20
-_NEWTON_DIFFERENCE = 1e-6
-_UNDISTORT_TOLERANCE = 1e-7
-"""Largest error of an undistorted slope, distorted again: far below a pixel."""
 
 
 class LensModel(StrEnum):
@@ -346,29 +338,4 @@ class Lens:
         return (
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
-
-    def undistort(
-        self, x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]
-    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
-        """Return the slopes of the rays that meet the image plane at (x, y): the inverse of `distort`.
-
-        Raises InvalidInputError for a point that no ray meets, beyond the range in which the model can be inverted.
-        """
-        u, v, h = x, y, _NEWTON_DIFFERENCE
-        with np.errstate(all="ignore"):
-            for _ in range(_NEWTON_STEPS):
-                error_x, error_y = (at - to for at, to in zip(self.distort(u, v), (x, y), strict=True))
-                if max(np.abs(error_x).max(initial=0.0), np.abs(error_y).max(initial=0.0)) <= _UNDISTORT_TOLERANCE:
-                    return u, v
-                right, left, below, above = (
-                    self.distort(u + du, v + dv) for du, dv in ((h, 0), (-h, 0), (0, h), (0, -h))
-                )
-                xu, yu, xv, yv = right[0] - left[0], right[1] - left[1], below[0] - above[0], below[1] - above[1]
-                scale = 2 * h / (xu * yv - xv * yu)
-                u, v = u - scale * (yv * error_x - xv * error_y), v - scale * (xu * error_y - yu * error_x)
-        worst = int(np.argmax(np.nan_to_num(np.hypot(error_x, error_y), nan=np.inf)))
-        raise InvalidInputError(
-            f"lens {self}: expected a model that can be inverted over the image, "
-            f"got none at the slope ({x[worst]:.2f}, {y[worst]:.2f})"
         )

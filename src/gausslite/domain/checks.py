@@ -7,6 +7,11 @@ import re
 
 from gausslite.domain.errors import InvalidInputError
 
+MAX_NAME_BYTES = 255
+MAX_IDENTIFIER_CHARACTERS = 64
+_IDENTIFIER = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_IDENTIFIER_CHARACTERS - 1}}}")
+_MAX_QUOTED_CHARACTERS = 64
+
 
 def require_instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
     """Raise InvalidInputError unless the value has the type; expected: a description of the type, for the message."""
@@ -39,12 +44,6 @@ def describe(value: object) -> str:
     """Return a short text of a value for messages: its type and the start of its text."""
     text = repr(value)
     return f"{type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"
-
-
-MAX_NAME_BYTES = 255
-MAX_IDENTIFIER_CHARACTERS = 64
-_IDENTIFIER = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_IDENTIFIER_CHARACTERS - 1}}}")
-_MAX_QUOTED_CHARACTERS = 64
 
 
 def require_name(field: str, name: str) -> None:

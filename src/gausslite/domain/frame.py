@@ -24,6 +24,17 @@ _COLOUR_SAMPLES, _ONE_COLOUR_LEVELS, _ONE_COLOUR_SHARE = 1200, 4, 0.95
 """An image of one colour has this share of its pixels within so many levels of the median. Images of real recordings
 and simulated homes have at most 0.4."""
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
+_LATE_IN_A_ROW = 5
+MAX_DEPTH_M = 65.535
+"""Farthest depth on the wire; no sensor measures a room beyond it."""
+_FAR_SHARE = 0.9
+NO_DEPTH, ONE_COLOUR = "no pixel has a depth reading", "the colour image has one colour"
+TOO_FAR = "depth lies beyond 65.5 m, as millimetres that are read as metres do"
+MAX_COORDINATE_M = 10_000.0
+"""Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+# start-of-frame markers contain the size; C4, C8 and CC are tables
+_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def without_depth_edges(depth_m: Float32[ndarray, "h w"], distance_px: int) -> Float32[ndarray, "h w"]:
@@ -41,9 +52,6 @@ def without_depth_edges(depth_m: Float32[ndarray, "h w"], distance_px: int) -> F
     side = 2 * distance_px - 1
     near_jumps = cv2.dilate(jumps.view(np.uint8), np.ones((side, side), np.uint8))
     return np.where(near_jumps > 0, np.float32(0.0), depth_m)
-
-
-_LATE_IN_A_ROW = 5
 
 
 class ClockJumps:
@@ -107,21 +115,10 @@ def _repeated(blocks: Float32[ndarray, "bh bw"], times: int, shape: tuple[int, .
     return image[: shape[0], : shape[1]]
 
 
-MAX_DEPTH_M = 65.535
-"""Farthest depth on the wire; no sensor measures a room beyond it."""
-_FAR_SHARE = 0.9
-NO_DEPTH, ONE_COLOUR = "no pixel has a depth reading", "the colour image has one colour"
-TOO_FAR = "depth lies beyond 65.5 m, as millimetres that are read as metres do"
-
-
 def is_too_far(depth_m: Float32[ndarray, "h w"]) -> bool:
     """True if nearly all readings are farther than any sensor measures, so that their unit is another one."""
     measured, far = np.count_nonzero(depth_m), np.count_nonzero(depth_m >= np.float32(MAX_DEPTH_M))
     return bool(far > _FAR_SHARE * measured)
-
-
-MAX_COORDINATE_M = 10_000.0
-"""Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 
 
 class FrameId(NamedTuple):
@@ -147,8 +144,8 @@ class Frame:
     detectors; None if it never was. Raises ShapeError, PoseError, InvalidInputError.
     """
 
-    index: int
-    capture_time_ns: int
+    index: int  # number in the sequence
+    capture_time_ns: int  # of the sensor's clock
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
     camera: Camera
@@ -202,11 +199,6 @@ class Frame:
         median = np.median(colours, axis=0)
         near = (np.abs(colours - median) <= _ONE_COLOUR_LEVELS).all(axis=1)
         return ONE_COLOUR if near.mean() >= _ONE_COLOUR_SHARE else ""
-
-
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-# start-of-frame markers contain the size; C4, C8 and CC are tables
-_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:

@@ -24,11 +24,11 @@ class Gaussians:
     kappa counts the active-phase iterations that trained a Gaussian; target indexes TaskGraph.targets (-1 none).
     """
 
-    means_m: Float32[ndarray, "n 3"]
-    quats_wxyz: Float32[ndarray, "n 4"]
-    scales_m: Float32[ndarray, "n 3"]
-    opacities: Float32[ndarray, " n"]
-    rgb: Float32[ndarray, "n 3"]
+    means_m: Float32[ndarray, "n 3"]  # μ, in the world
+    quats_wxyz: Float32[ndarray, "n 4"]  # unit quaternions of R
+    scales_m: Float32[ndarray, "n 3"]  # standard deviations along the axes, the diagonal of S
+    opacities: Float32[ndarray, " n"]  # o, from 0 to 1
+    rgb: Float32[ndarray, "n 3"]  # c, in [0, 1] but for rounding
     active: Bool[ndarray, " n"]
     kappa: UInt32[ndarray, " n"]
     target: Int16[ndarray, " n"]

@@ -17,6 +17,11 @@ from gausslite.domain.pose import transform_points
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
+MAX_OBJECTS_PER_AGENT = 200
+MAX_OBJECT_COORDINATE_M = 1e6
+_MAX_TIME_NS = 1 << 62
+_CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+
 
 class MatchBasis(StrEnum):
     """Why a noun is searched as these classes. SIMILAR classes are different things; NONE: there is no class."""
@@ -37,17 +42,16 @@ class NounMatch:
     """The classes that a detector searches for one noun of a task.
 
     similarity: cosine of the noun's and the class's centred text features, None without a comparison. accepted: False
-    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known:
-    the ground truth's regions, or the classes near to a noun without one. min_score: from which a detection counts.
+    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched.
     """
 
     noun: str
-    basis: MatchBasis
+    basis: MatchBasis  # how the classes were found
     classes: tuple[str, ...] = ()
     similarity: float | None = None
     accepted: bool = True
-    known: tuple[str, ...] = ()
-    min_score: float | None = None
+    known: tuple[str, ...] = ()  # the ground truth's regions, or the classes near to a noun without one
+    min_score: float | None = None  # from which a detection counts
 
     @property
     def is_searched(self) -> bool:
@@ -85,18 +89,14 @@ class NounMatch:
 
 @dataclass(frozen=True, slots=True)
 class NounReport:
-    """A noun's match, and what has been detected of it so far.
-
-    detections: their number in all frames. best_score: the highest, in best_frame, below thresholds too; 0 and None
-    without any. objects: the number of confirmed ones. rival: the class that the detections rather show, or None.
-    """
+    """A noun's match, and what has been detected of it so far."""
 
     match: NounMatch
-    detections: int = 0
-    best_score: float = 0.0
-    objects: int = 0
-    rival: str | None = None
-    best_frame: int | None = None
+    detections: int = 0  # their number in all frames
+    best_score: float = 0.0  # the highest, in best_frame, below thresholds too; 0 and None without any
+    objects: int = 0  # the number of confirmed ones
+    rival: str | None = None  # the class that the detections rather show, or None
+    best_frame: int | None = None  # number of the frame with the best score
 
     def describe(self) -> str:
         """Return one line for the operator: what was found, or why nothing was."""
@@ -120,13 +120,6 @@ def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:
     return tuple(match.warning for match in matches if match.warning is not None)
 
 
-MAX_OBJECTS_PER_AGENT = 200
-NO_TARGET_INDEX = -1
-MAX_OBJECT_COORDINATE_M = 1e6
-_MAX_TIME_NS = 1 << 62
-_CORNERS = np.array(list(np.ndindex(2, 2, 2)))
-
-
 class ObjectRole(StrEnum):
     """Role of an object in a task graph; OTHER: a target's noun, but not the place or colour that the task states."""
 
@@ -139,16 +132,16 @@ class ObjectRole(StrEnum):
 class ObjectLandmark:
     """One object of one agent or of a team; noun is a noun phrase of a task.
 
-    centroid_m: mean of its observed surface cells; extent_m: their axis-aligned box. confidence: 0 to 1. first_seen_ns,
-    last_seen_ns: capture times of the first and the latest frame that showed it. Raises InvalidInputError.
+    first_seen_ns, last_seen_ns: capture times of the first and the latest frame that showed it. Raises
+    InvalidInputError.
     """
 
-    object_id: str
+    object_id: str  # unique in the report, stable while the object is known
     noun: str
     role: ObjectRole
-    centroid_m: tuple[float, float, float]
-    extent_m: AxisAlignedBox
-    confidence: float
+    centroid_m: tuple[float, float, float]  # mean of its observed surface cells
+    extent_m: AxisAlignedBox  # axis-aligned box of these cells
+    confidence: float  # 0 to 1
     first_seen_ns: int
     last_seen_ns: int
 
@@ -198,7 +191,7 @@ class Answer:
     """The objects that a question means, and why there may be others. A count is their number."""
 
     objects: tuple[ObjectLandmark, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # why there may be other objects
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,19 +207,14 @@ class ObjectReport:
         if len({landmark.object_id for landmark in self.objects}) != len(self.objects):
             raise InvalidInputError("objects: expected different ids, got a repeated one")
 
-    def target_index(self, noun: str) -> int:
-        """Return the index of a noun among the task's targets, as in a Gaussian's `target`; -1 for other nouns."""
-        nouns = [noun_of(target) for target in self.graph.targets]
-        return nouns.index(noun) if noun in nouns else NO_TARGET_INDEX
-
 
 @dataclass(frozen=True, slots=True)
 class ObjectObserver:
-    """One agent's observation of a team's object; target: index of the noun in the agent's task, -1 for an anchor."""
+    """One agent's observation of a team's object."""
 
     agent_id: str
     object_id: str
-    target: int
+    target: int  # index of the noun in the agent's task, -1 for an anchor
     confidence: float
     first_seen_ns: int
     last_seen_ns: int
@@ -236,7 +224,7 @@ class ObjectObserver:
 class TeamObject:
     """An object merged from the reports of the agents that observed it."""
 
-    landmark: ObjectLandmark
+    landmark: ObjectLandmark  # merged over the observers
     observers: tuple[ObjectObserver, ...]
 
 

@@ -18,6 +18,10 @@ UpAxis = tuple[float, float, float]
 
 _RIGIDITY_TOLERANCE = 1e-2
 _UNIT_TOLERANCE = 1e-3
+_MIN_BASELINE_S = 1e-6
+_TYPICAL_DISTANCE_M = 2.0
+_MAX_VELOCITY_CHANGE = 0.5
+_MAX_GAP_RATIO = 2.0
 
 
 def require_rigid(name: str, T: Float[ndarray, "4 4"]) -> None:
@@ -123,11 +127,11 @@ def upward_axis(T_world_camera: Float64[ndarray, "t 4 4"]) -> UpAxis:
 class PoseCorrection:
     """The latest correction of the odometry: T_map_camera = T_map_odometry · T_odometry_camera.
 
-    capture_time_ns: time of the frame that it was estimated from. translation_std_m, rotation_std_deg: by how much the
-    corrections of successive frames differ, along and about each axis: the error of using it for the next frame.
+    translation_std_m, rotation_std_deg: by how much the corrections of successive frames differ, along and about each
+    axis: the error of using it for the next frame.
     """
 
-    capture_time_ns: int
+    capture_time_ns: int  # time of the frame that it was estimated from
     T_map_odometry: Float64[ndarray, "4 4"]
     translation_std_m: float
     rotation_std_deg: float
@@ -174,17 +178,11 @@ def pose_at(times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"], time_n
     return interpolate_poses(T[before], T[after], share)
 
 
-_MIN_BASELINE_S = 1e-6
-_TYPICAL_DISTANCE_M = 2.0
-_MAX_VELOCITY_CHANGE = 0.5
-_MAX_GAP_RATIO = 2.0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Twist:
     """A camera's velocity in its own axes: T_world_camera(t + dt) ≈ T_world_camera(t) · exp(dt · twist)."""
 
-    linear_m_s: Float64[ndarray, "3"]
+    linear_m_s: Float64[ndarray, "3"]  # of the camera's centre
     angular_rad_s: Float64[ndarray, "3"]
 
     @property
@@ -201,7 +199,7 @@ class Twist:
 class Trajectory:
     """Poses at ascending times. Raises ShapeError, InvalidInputError."""
 
-    times_s: Float64[ndarray, " n"]
+    times_s: Float64[ndarray, " n"]  # of the frames' capture
     T_world_camera: Float64[ndarray, "n 4 4"]
 
     def __post_init__(self) -> None:

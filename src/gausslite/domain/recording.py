@@ -15,6 +15,10 @@ from gausslite.domain.pose import transform_of
 
 _MAX_TIME_OFFSET_S = 1.0
 _NAMES = ("lens", "readout", "offset", "exposure")
+_MAX_BASELINE_M = 1.0
+_MAX_ROTATION_DEG = 45.0
+_MAX_STD = 1000.0
+"""Upper bound of every standard deviation; its square is still a finite float."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,14 +26,13 @@ class CameraCorrection:
     """How recorded images differ from those of an ideal camera.
 
     readout_s: time from the exposure of the first row to that of the last; negative if rows are read from the bottom.
-    time_offset_s: add it to an image's stamp to get the trajectory's time of its middle row. exposure_s: each row's
-    exposure time, which blurs moving images; 0 for none. Raises InvalidInputError.
+    Raises InvalidInputError.
     """
 
     lens: Lens | None = None
     readout_s: float = 0.0
-    time_offset_s: float = 0.0
-    exposure_s: float = 0.0
+    time_offset_s: float = 0.0  # add it to an image's stamp to get the trajectory's time of its middle row
+    exposure_s: float = 0.0  # each row's exposure time, which blurs moving images; 0 for none
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
@@ -71,10 +74,6 @@ class CameraCorrection:
         """True if images are used as recorded."""
         times_s = self.readout_s, self.time_offset_s, self.exposure_s
         return not any(times_s) and (self.lens is None or self.lens.is_identity)
-
-
-_MAX_BASELINE_M = 1.0
-_MAX_ROTATION_DEG = 45.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +135,6 @@ class DepthRegistration:
     def camera(self, width_px: int, height_px: int) -> Camera:
         """Return the colour camera (pixel centres at +0.5)."""
         return self.intrinsics.camera("depth registration", width_px, height_px)
-
-
-_MAX_STD = 1000.0
-"""Upper bound of every standard deviation; its square is still a finite float."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,11 @@ _MAX_COORDINATE_M = 1e6
 _NEAR_M = 1e-3
 MIN_ROI_PIXELS = 64
 """A view with fewer region pixels does not show the region: it is not scored there, and pictures avoid it."""
+PointM = tuple[float, float, float]
+"""A point in the world in metres."""
+UNNAMED: Final = "object"
+"""The noun of an object that a person points at without a word."""
+NO_TARGET = -1
 
 
 @runtime_checkable
@@ -35,7 +40,7 @@ class Region(Protocol):
 class BallRegion:
     """All surface points within radius_m of a world point."""
 
-    centre_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float]  # in the world
     radius_m: float
 
     def __post_init__(self) -> None:
@@ -70,12 +75,6 @@ class TargetPoint:
     def ball(self) -> BallRegion:
         """Return the ball of the radius, of a metre without one. Raises InvalidInputError."""
         return BallRegion(self.point_m, 1.0 if self.radius_m is None else self.radius_m)
-
-
-PointM = tuple[float, float, float]
-"""A point in the world in metres."""
-UNNAMED: Final = "object"
-"""The noun of an object that a person points at without a word."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,32 +155,28 @@ def _world_points(frame: Frame, window: tuple[slice, slice]) -> Float[ndarray, "
     return transform_points(frame.T_world_camera, points)
 
 
-NO_TARGET = -1
-
-
 @dataclass(frozen=True, slots=True)
 class Rival:
     """A class of a different thing that a detector finds in the same place, and its score."""
 
-    name: str
+    name: str  # the class that was detected
     score: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class.
+    """One detected object in one image. box_px is (left, top, right, bottom).
 
     is_weak: the score is below the detector's threshold. It supports an object that other frames found, nothing else.
-    is_exact: the mask is ground truth, not a network's.
     """
 
-    phrase: str
+    phrase: str  # the noun that was searched
     score: float
     box_px: tuple[float, float, float, float]
-    mask: Bool[ndarray, "h w"]
-    rival: Rival | None = None
+    mask: Bool[ndarray, "h w"]  # the object's pixels
+    rival: Rival | None = None  # None without another class
     is_weak: bool = False
-    is_exact: bool = False
+    is_exact: bool = False  # the mask is ground truth, not a network's
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,18 +185,18 @@ class DetectedBox:
 
     phrase: str
     score: float
-    box_px: tuple[float, float, float, float]
+    box_px: tuple[float, float, float, float]  # left, top, right, bottom
     rival: Rival | None = None
     is_weak: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedImage:
-    """What the detector has found in one image, objects that the task leaves out included. index: of the frame."""
+    """What the detector has found in one image, objects that the task leaves out included."""
 
-    index: int
+    index: int  # of the frame
     rgb: UInt8[ndarray, "h w 3"]
-    boxes: tuple[DetectedBox, ...]
+    boxes: tuple[DetectedBox, ...]  # what was found, the weak ones too
 
     @classmethod
     def of(cls, frame: Frame, detections: Sequence[Detection]) -> DetectedImage:
@@ -220,32 +215,27 @@ class DetectedImage:
 class CameraView:
     """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
 
-    roi: True in the task's region. times_ns: the capture times of the path, oldest first. detected: what the detector
-    found in the image on which it ran last; None without a detector.
+    detected: what the detector found in the image on which it ran last; None without a detector.
     """
 
     rgb: UInt8[ndarray, "h w 3"]
-    roi: Bool[ndarray, "h w"]
+    roi: Bool[ndarray, "h w"]  # True in the task's region
     camera: Camera
     frame_index: int
     T_world_camera: Float64[ndarray, "4 4"]
-    times_ns: Int64[ndarray, " t"]
-    path: Float64[ndarray, "t 4 4"]
+    times_ns: Int64[ndarray, " t"]  # the capture times of the path, oldest first
+    path: Float64[ndarray, "t 4 4"]  # pose of each mapped frame
     keyframes: Float64[ndarray, "k 4 4"]
     detected: DetectedImage | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelevanceMap:
-    """Relevance of one frame.
+    """Relevance of one frame."""
 
-    pixel_weights: the paper's w(u, v), in [0, 1]. target: for each pixel, the index of its target in TaskGraph.targets,
-    -1 for none. known_objects: how many objects of the task were known when this was estimated.
-    """
-
-    pixel_weights: Float32[ndarray, "h w"]
-    target: Int16[ndarray, "h w"]
-    known_objects: int = 0
+    pixel_weights: Float32[ndarray, "h w"]  # the paper's w(u, v), in [0, 1]
+    target: Int16[ndarray, "h w"]  # for each pixel, the index of its target in TaskGraph.targets, -1 for none
+    known_objects: int = 0  # how many objects of the task were known when this was estimated
 
     def __post_init__(self) -> None:
         require_array("relevance pixel_weights", self.pixel_weights, (None, None), np.float32)

@@ -17,6 +17,7 @@ State = Mapping[str, NDArray[Any]]
 """Arrays by name; a component adds its name and a slash as the prefix of its parts' names."""
 
 _MAX_MAGNITUDE = 1e6
+_LOW_64_BITS = (1 << 64) - 1
 
 
 def add_prefix(prefix: str, state: State) -> dict[str, NDArray[Any]]:
@@ -70,9 +71,6 @@ def get_text(state: State, name: str) -> str:
         return get_array(state, name, (None,), np.uint8).tobytes().decode()
     except UnicodeDecodeError:
         raise MapFileError(f"state {name}: expected UTF-8 text, got other bytes") from None
-
-
-_LOW_64_BITS = (1 << 64) - 1
 
 
 def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:

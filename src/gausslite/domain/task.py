@@ -11,6 +11,7 @@ from typing import Final, Protocol, runtime_checkable
 from gausslite.domain.errors import TaskError
 
 _NUMBER_SUFFIX: Final = re.compile(r"_\d+$")
+EXAMPLE = "'Pick up the mug on the table'"
 
 
 class Predicate(StrEnum):
@@ -64,13 +65,13 @@ class Superlative(StrEnum):
 class Relation:
     """`predicate(target, anchor)`; both are names of the graph.
 
-    negated: the relation does not hold. min_m, max_m: bounds of the distance to the anchor; equal bounds mean "about".
+    min_m, max_m: bounds of the distance to the anchor; equal bounds mean "about".
     """
 
     predicate: Predicate
     target: str
     anchor: str
-    negated: bool = False
+    negated: bool = False  # the relation does not hold
     min_m: float | None = None
     max_m: float | None = None
 
@@ -102,19 +103,18 @@ class TaskGraph:
 
     Targets, anchors and excluded objects are names: a noun, with the suffix _2, _3, ... for a further object of that
     noun with other attributes. roles has one role per target; an empty tuple means that every target is an object.
-    excluded: objects to leave out. context: rooms and places, which locate nothing. See docs/guides/task.md.
     """
 
     task_id: str
-    text: str
+    text: str  # the sentence
     targets: tuple[str, ...]
     anchors: tuple[str, ...]
     relations: tuple[Relation, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what the parser did not understand, for the operator
     roles: tuple[TargetRole, ...] = ()
     attributes: tuple[ObjectAttributes, ...] = ()
-    excluded: tuple[str, ...] = ()
-    context: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()  # objects to leave out
+    context: tuple[str, ...] = ()  # rooms and places, which locate nothing. See docs/guides/task.md
 
     def __post_init__(self) -> None:
         if not self.roles:
@@ -174,9 +174,6 @@ class TaskParser(Protocol):
 def noun_of(name: str) -> str:
     """Return the noun of an object's name: "block_2" is a "block"."""
     return _NUMBER_SUFFIX.sub("", name)
-
-
-EXAMPLE = "'Pick up the mug on the table'"
 
 
 @dataclass(frozen=True, slots=True)

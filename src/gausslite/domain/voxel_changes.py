@@ -19,6 +19,8 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
 from gausslite.domain.voxels import VoxelIndex, tiles_of
 
+MAX_REMOVED_VOXELS = 100_000
+
 
 def hash_columns(*columns: NDArray[Any]) -> UInt64[ndarray, " n"]:
     """Return a 64-bit hash of each row of these integer columns; the same in every process and on every machine.
@@ -32,9 +34,6 @@ def hash_columns(*columns: NDArray[Any]) -> UInt64[ndarray, " n"]:
         hashed = (hashed ^ (hashed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         hashed ^= hashed >> np.uint64(31)
     return hashed
-
-
-MAX_REMOVED_VOXELS = 100_000
 
 
 class RevisionLog:

@@ -14,6 +14,14 @@ from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 
+MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
+BITS_PER_AXIS = 21
+_OFFSET = 1 << (BITS_PER_AXIS - 1)
+_MASK = (1 << BITS_PER_AXIS) - 1
+TILE_VOXELS = 16
+"""Voxels of a tile along each axis."""
+_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * BITS_PER_AXIS) for axis in range(3))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelBatch:
@@ -53,16 +61,12 @@ class VoxelBatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoiSubset:
-    """One message of an agent: its updates of some voxels.
-
-    update_seq: sequence number of these updates; in each voxel, the update with the highest one is the latest.
-    message_seq: number of the message in its session, for cumulative acknowledgements.
-    """
+    """One message of an agent: its updates of some voxels."""
 
     agent_id: str
     session_id: str
-    message_seq: int
-    update_seq: int
+    message_seq: int  # number of the message in its session, for cumulative acknowledgements
+    update_seq: int  # sequence number of these updates; in each voxel, the update with the highest one is the latest
     batch: VoxelBatch
 
     def __post_init__(self) -> None:
@@ -72,15 +76,6 @@ class RoiSubset:
             raise InvalidInputError(
                 f"subset message_seq and update_seq: expected at least 0, got {self.message_seq} and {self.update_seq}"
             )
-
-
-MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
-BITS_PER_AXIS = 21
-_OFFSET = 1 << (BITS_PER_AXIS - 1)
-_MASK = (1 << BITS_PER_AXIS) - 1
-TILE_VOXELS = 16
-"""Voxels of a tile along each axis."""
-_TILE_MASK = sum((_MASK - (TILE_VOXELS - 1)) << (axis * BITS_PER_AXIS) for axis in range(3))
 
 
 @dataclass(frozen=True, slots=True)

@@ -227,7 +227,8 @@ class FusionEngine:
 
         If it has a former one, that is released, and UnavailableError is raised until it has been deleted.
         """
-        needed, limit = self.store.memory_bytes(subset.agent_id, subset.voxels.keys), self.settings.agent_bytes
+        needed = self.store.memory_bytes(subset.agent_id, subset.voxels.keys) + self.maps.moved_bytes(subset.agent_id)
+        limit = self.settings.agent_bytes
         if needed <= limit:
             return
         name = quote_name(subset.agent_id)
@@ -319,6 +320,8 @@ class FusionEngine:
             self.frames.unmoved -= {agent_id}
             self.maps.set_frame(agent_id, self.frames.get(agent_id))
         try:
+            if agent_id in self.frames.unused:
+                self._drop_refined(agent_id)
             self.maps.move(agent_id)
         except GaussLiteError:
             with self._changing:
@@ -360,16 +363,17 @@ class FusionEngine:
     def store_refined(self, gaussians: Gaussians, revision: int, sources: tuple[str, ...]) -> None:
         """Store the result of a refinement of the vote at this revision, shaped by these agents' keyframes.
 
-        Raises RevisionGoneError, StorageError, MismatchError if one of them has been evicted meanwhile.
+        Raises RevisionGoneError, StorageError, MismatchError if one of them has been evicted or quarantined meanwhile.
         """
         shown = self.maps.show_refined(gaussians, revision, sources)
         # no update may be in the store without being in the change log
         with self._changing:
             changed = self.maps.changed_since(revision)
         save_refinement(self.store, shown.without(changed))
-        if gone := [name for name in sources if not self.keyframes.count(name)]:
+        unused = self.frames.unused
+        if gone := [name for name in sources if name in unused or not self.keyframes.count(name)]:
             self._drop_refined(gone[0])
-            raise MismatchError(f"refinement: expected the keyframes of {', '.join(gone)} to stay, got them deleted")
+            raise MismatchError(f"refinement: expected the keyframes of {', '.join(gone)} to stay, got them out of use")
 
     def _drop_refined(self, agent_id: str) -> None:
         """Show the vote in place of a refined map that the agent's keyframes shaped, also after a restart."""

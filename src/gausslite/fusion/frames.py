@@ -43,18 +43,16 @@ class AlignmentState(StrEnum):
 class Misfit:
     """Mean point-to-plane distance and luminance difference of samples of one map to another, both saturated."""
 
-    distance_m: float
-    colour: float
+    distance_m: float  # to the plane of the nearest surface
+    colour: float  # of the luminance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFit:
     """A motion of the source map, and the misfit before and after it on the held-out half of the overlap.
 
-    shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
-    is_better: distance and colour improve by more than four times their uncertainty. is_apart: before the motion, the
-    surfaces are farther apart than those of maps in the same frame. is_sure: with the motion, or as they are if it is
-    no better, the maps fit better than after any shift or turn.
+    shift_m, rotation_deg: the motion of the overlap's centre and its angle. is_sure: with the motion, or as they are if
+    it is no better, the maps fit better than after any shift or turn.
     """
 
     motion: Float64[ndarray, "4 4"]
@@ -62,9 +60,9 @@ class FrameFit:
     after: Misfit
     shift_m: float
     rotation_deg: float
-    compared: int
-    is_better: bool
-    is_apart: bool
+    compared: int  # number of held-out samples
+    is_better: bool  # distance and colour improve by more than four times their uncertainty
+    is_apart: bool  # before the motion, the surfaces are farther apart than those of maps in the same frame
     is_sure: bool = False
 
     @classmethod
@@ -84,21 +82,16 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameAlignment:
-    """The state of one agent.
+    """The state of one agent."""
 
-    segments: ascending. order: rank of its first update among the agents. against: the agents that it contradicts.
-    message: why it is corrected, quarantined or about to be. is_unknown: the agent does not know its frame; its first
-    segment is what the server has found.
-    """
-
-    order: int
+    order: int  # rank of its first update among the agents
     state: AlignmentState = AlignmentState.UNKNOWN
-    segments: tuple[Segment, ...] = ()
-    fit: FrameFit | None = None
-    message: str = ""
-    declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    against: tuple[str, ...] = ()
-    is_unknown: bool = False
+    segments: tuple[Segment, ...] = ()  # ascending
+    fit: FrameFit | None = None  # the latest one that was compared
+    message: str = ""  # why it is corrected, quarantined or about to be
+    declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # T_fused_agent that the agent states
+    against: tuple[str, ...] = ()  # the agents that it contradicts
+    is_unknown: bool = False  # the agent does not know its frame; its first segment is what the server has found
 
     @property
     def T_fused_agent(self) -> Float64[ndarray, "4 4"]:  # noqa: N802 - a transform names both frames

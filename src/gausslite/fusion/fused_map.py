@@ -56,14 +56,13 @@ class RefinedMap:
 class StoredRefinement:
     """A refined map without the voxels that have changed, and a hash of the vote's winner in every unchanged voxel.
 
-    After a restart, the hashes tell which voxels have changed since. voted_keys are ascending. sources: the agents
-    whose keyframes shaped it.
+    After a restart, the hashes tell which voxels have changed since. voted_keys are ascending.
     """
 
     batch: VoxelBatch
     voted_keys: Int64[ndarray, " v"]
-    winner_hashes: UInt64[ndarray, " v"]
-    sources: tuple[str, ...]
+    winner_hashes: UInt64[ndarray, " v"]  # of the vote when it was refined
+    sources: tuple[str, ...]  # the agents whose keyframes shaped it
 
     def without(self, changed: Int64[ndarray, " c"]) -> StoredRefinement:
         """Return the refinement without these voxels, which changed since it started."""
@@ -134,7 +133,7 @@ class WonVoxels:
     """Voxels of a layer with their Gaussians, and the keys that each agent wins in the vote."""
 
     batch: VoxelBatch
-    keys_by_winner: Mapping[str, Sequence[int]]
+    keys_by_winner: Mapping[str, Sequence[int]]  # ascending
 
     def of(self, agent_id: str) -> VoxelBatch:
         """Return the voxels that this agent wins."""
@@ -155,7 +154,7 @@ class FusedMapChanges:
 
     revision: int
     won: WonVoxels
-    removed: Int64[ndarray, " e"]
+    removed: Int64[ndarray, " e"]  # voxels that have no winner any more
 
 
 class FusedMapLayers:
@@ -233,6 +232,11 @@ class FusedMapLayers:
         """Return the agent's updates as the vote reads them. Raises StorageError."""
         with self._lock:
             return self._votes.batch(agent_id)
+
+    def moved_bytes(self, agent_id: str) -> int:
+        """Return the memory that an agent's voxels take here as they are in another frame."""
+        with self._lock:
+            return self._votes.memory_bytes(agent_id)
 
     def begin_map(self, agent_id: str, moved: Sequence[str], dropped: Sequence[str]) -> str:
         """Begin another map of an agent; as FusionStore.begin_map. Raises StorageError."""

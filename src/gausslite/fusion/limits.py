@@ -29,7 +29,7 @@ class MissionConfig:
 
     mission_id: str
     world_frame: str
-    voxel_size_m: float
+    voxel_size_m: float  # edge of the vote's voxels δ
 
     def with_default_names(self) -> MissionConfig:
         """Return the configuration with "mission" and "world" in place of empty names."""
@@ -75,20 +75,16 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class Quotas:
-    """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them.
-
-    kappa_at_join: of one Gaussian at the agent's first join; kappa_per_second: its growth since then. An agent at 4 Hz
-    with 8 iterations a frame trains a Gaussian at most 32 times a second.
-    """
+    """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them."""
 
     agents: int = option(64, "largest number of agents", key="quota-agents", low=1)
     voxels_per_agent: int = option(500_000, "largest number of voxels per agent", key="quota-voxels", low=1)
     gaussians_per_agent: int = option(3_000_000, "largest number of Gaussians per agent", key="quota-gaussians", low=1)
     keyframes_per_agent: int = option(64, "largest number of keyframes per agent", key="quota-keyframes", low=1)
-    keyframe_pixels: int = 1920 * 1080
+    keyframe_pixels: int = 1920 * 1080  # of one image
     keyframe_bytes_per_agent: int = 64 << 20
-    kappa_at_join: int = 120_000
-    kappa_per_second: int = 200
+    kappa_at_join: int = 120_000  # highest kappa of one Gaussian at the agent's first join
+    kappa_per_second: int = 200  # its growth since then: at 4 Hz, 8 iterations train it 32 times a second
 
     def __post_init__(self) -> None:
         for quota in fields(self):
@@ -119,7 +115,6 @@ class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
     max_removed_voxels: number of removed voxels that a watcher can still catch up with; see VoxelLog.
-    lease_s: time after an agent's last call during which no other robot can take its name.
     """
 
     grid: VoxelGrid = option(VoxelGrid(), "edge of the voxels", **VOXEL_SIZE)
@@ -137,7 +132,7 @@ class FusionSettings:
         to_plain=lambda size: size >> 20,
     )
     max_removed_voxels: int = MAX_REMOVED_VOXELS
-    lease_s: float = DEFAULT_LEASE_S
+    lease_s: float = DEFAULT_LEASE_S  # time after an agent's last call during which no other robot can take its name
 
     def __post_init__(self) -> None:
         if self.mission_id:

@@ -19,6 +19,9 @@ from gausslite.fusion.store import FusionStore
 _log = logging.getLogger(__name__)
 RECORD = "ban"
 _BANNED = b"banned"
+_MAX_REPLACED_SESSIONS = 1000
+TOKEN_RECORD = "join-token"  # noqa: S105 - the name of a record
+_NAME_TAKEN = "another robot uses this name; give each its own agent id"
 
 
 class BanList:
@@ -49,11 +52,6 @@ class BanList:
         # it has nothing else
         self._store.remove_agent(agent_id)
         self.agents = tuple(name for name in self.agents if name != agent_id)
-
-
-_MAX_REPLACED_SESSIONS = 1000
-TOKEN_RECORD = "join-token"  # noqa: S105 - the name of a record
-_NAME_TAKEN = "another robot uses this name; give each its own agent id"
 
 
 class SessionRegistry:

@@ -52,7 +52,7 @@ class RefineSettings:
     seed: int = 0
     report_every: int = 10
     check_every: int = 50
-    max_prepared_views: int = 96
+    max_prepared_views: int = 96  # views in memory at a time
 
     def __post_init__(self) -> None:
         for name in ("max_gaussians", "report_every", "check_every", "max_prepared_views"):
@@ -62,12 +62,10 @@ class RefineSettings:
 
 @dataclass(frozen=True, slots=True)
 class RefineProgress:
-    """The state of a refinement after `iteration` of `iterations`; left_out: agents of which
-    keyframes disagree with the vote, and how many.
-    """
+    """The state of a refinement after `iteration` of `iterations`."""
 
     iteration: int
     iterations: int
     loss: float
     gaussians: int
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # agents whose keyframes disagree with the vote, and how many of them

@@ -37,6 +37,14 @@ _LEAST_SIZE = 16
 """What a tile that is deleted costs at least, in voxels."""
 VOXEL_UNITS = 2
 """The size of a voxel beside its Gaussians, in units of one Gaussian."""
+ROWS = np.dtype([("tiles", "i8"), ("numbers", "i8"), ("sizes", "i8")])
+"""Rows of a store: their tiles, numbers, and sizes in units."""
+_TILES = np.dtype([("written", "u4"), ("used", "u4"), ("digests", "u8"), ("rows", "i8")])
+_NO_TILE = np.array((0, 0, 0, -1), _TILES)
+_PACKED = np.dtype(_COLUMNS)
+_NO_VOXEL = np.array((-1, 0, 0, -1), _PACKED)
+ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[EncodedVoxels]]
+"""Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,16 +91,6 @@ class AgentTotals:
 def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
     """Return a sum that cannot wrap around."""
     return sum(values.tolist())
-
-
-ROWS = np.dtype([("tiles", "i8"), ("numbers", "i8"), ("sizes", "i8")])
-"""Rows of a store: their tiles, numbers, and sizes in units."""
-_TILES = np.dtype([("written", "u4"), ("used", "u4"), ("digests", "u8"), ("rows", "i8")])
-_NO_TILE = np.array((0, 0, 0, -1), _TILES)
-_PACKED = np.dtype(_COLUMNS)
-_NO_VOXEL = np.array((-1, 0, 0, -1), _PACKED)
-ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[EncodedVoxels]]
-"""Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
 
 class _Map:

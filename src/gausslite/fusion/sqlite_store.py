@@ -41,6 +41,13 @@ CREATE TABLE voxel_updates (
     number INTEGER PRIMARY KEY, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, voxels BLOB NOT NULL);
 {TABLES}
 """
+_DELETE = "DELETE FROM voxel_updates WHERE number = ?"
+_ADD_TO_SUM = "UPDATE properties SET value = value + ? WHERE name = 'row_sum'"
+_INSERT = "INSERT INTO voxel_updates VALUES (?, ?, ?, ?)"
+SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
+"""UpdateRows."""
+_SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?))"  # noqa: S608
+_CHECKPOINT = "PRAGMA wal_checkpoint(PASSIVE)"
 
 
 @contextmanager
@@ -231,15 +238,6 @@ def _explain(error: sqlite3.Error) -> str:
     if "full" in text:
         return "no space left (disk full or the store's size limit); nothing of this message was stored"
     return f"refused ({text})"
-
-
-_DELETE = "DELETE FROM voxel_updates WHERE number = ?"
-_ADD_TO_SUM = "UPDATE properties SET value = value + ? WHERE name = 'row_sum'"
-_INSERT = "INSERT INTO voxel_updates VALUES (?, ?, ?, ?)"
-SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
-"""UpdateRows."""
-_SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?))"  # noqa: S608
-_CHECKPOINT = "PRAGMA wal_checkpoint(PASSIVE)"
 
 
 class SqliteStore(FusionStore):

@@ -19,6 +19,8 @@ from gausslite.fusion.update_log import PutOutcome
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id
 _PROBE = "", "storage-probe"
+ACKNOWLEDGEMENT_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+_LONGEST_WAIT_S = 5.0
 
 
 class StorageProbe:
@@ -39,10 +41,6 @@ class StorageProbe:
             self.is_writable = False
             raise
         self.is_writable = True
-
-
-ACKNOWLEDGEMENT_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
-_LONGEST_WAIT_S = 5.0
 
 
 class Acknowledgements:
@@ -108,13 +106,13 @@ class Acknowledgements:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCounters:
-    """Messages of one agent. last_seen_ns: time of its latest subset or sign of life, 0 before."""
+    """Messages of one agent."""
 
-    last_seen_ns: int = 0
-    roi_bytes: int = 0
-    handover_bytes: int = 0
+    last_seen_ns: int = 0  # time of its latest subset or sign of life, 0 before
+    roi_bytes: int = 0  # of the region's voxels, while the mission runs
+    handover_bytes: int = 0  # of the rest of the map, after it
     subsets_accepted: int = 0
-    subsets_stale: int = 0
+    subsets_stale: int = 0  # without a voxel that was new
     subsets_rejected: int = 0
 
     def plus(self, newer: TrafficCounters) -> TrafficCounters:
@@ -150,11 +148,11 @@ class AgentContribution:
     """Stored data of one agent, the number of voxels that it wins, its task's targets, its frame and its traffic."""
 
     agent_id: str
-    joined: bool = False
+    joined: bool = False  # a session is open
     voxels: int = 0
     gaussians: int = 0
-    kappa_sum: int = 0
-    won_voxels: int = 0
+    kappa_sum: int = 0  # over its voxels
+    won_voxels: int = 0  # where the vote chose it
     last_update_seq: int = 0
     keyframes: int = 0
     targets: tuple[str, ...] = ()
@@ -167,10 +165,10 @@ class MissionStatus:
     """The figures of a mission and of each agent."""
 
     mission_config: MissionConfig
-    revision: int
+    revision: int  # of the fused map
     fused_gaussians: int
     fused_voxels: int
     keyframes: int
-    refined: bool
+    refined: bool  # a refined map is there
     agents: tuple[AgentContribution, ...]
-    banned_agents: tuple[str, ...] = ()
+    banned_agents: tuple[str, ...] = ()  # may not contribute

@@ -40,26 +40,24 @@ _REWRITTEN = 4
 """How many times its own size a message may write anew; at 2, it would remove no more than it adds."""
 _LOADED_VOXELS = 1 << 16
 """Those of the rows that are read at a time."""
+_TileRow = tuple[int, int, EncodedVoxels]
+"""tile, number, voxels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PutOutcome:
     """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
 
-    accepted: Int64[ndarray, " a"]
+    accepted: Int64[ndarray, " a"]  # newer than what was stored
     stale: Int64[ndarray, " s"]
-
-
-_TileRow = tuple[int, int, EncodedVoxels]
-"""tile, number, voxels."""
 
 
 @dataclass(slots=True)
 class LogChange:
     """What one transaction deletes and writes. The log has it only after `apply`."""
 
-    deleted: list[int] = field(default_factory=list)
-    rows: list[UpdateRow] = field(default_factory=list)
+    deleted: list[int] = field(default_factory=list)  # row numbers
+    rows: list[UpdateRow] = field(default_factory=list)  # to insert
     puts: list[tuple[str, list[_TileRow], dict[int, list[int]]]] = field(default_factory=list)
     """Map, its new rows, and the rows of the tiles that were written anew."""
     outcomes: list[PutOutcome] = field(default_factory=list)

@@ -30,6 +30,21 @@ MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""
 RECORD = "first-joined"
 _SECONDS = struct.Struct("<d")
+# no agent can have an empty id
+_CLOCK = "", "mission-clock"
+_SAVE_INTERVAL_S = 60.0
+_LONGEST_PAUSE_S = 86_400.0
+SLICE_VOXELS = 2048
+"""A larger message is stored in parts of this size, so that it does not delay the other agents."""
+_MESSAGE_BYTES = 1024
+"""The cost of a message beside its content."""
+_MAX_PENDING, _AGENT_BYTES = 64, 4 << 20
+"""Of one agent; a robot waits for each acknowledgement, so it has one or two."""
+_TOTAL_BYTES = 64 << 20
+_GROUP_BYTES = 1 << 19
+"""Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
+_LATE_S, _LATE_LOG_S = 2.0, 10.0
+_log = logging.getLogger(__name__)
 
 
 def require_own(agent_id: str, named: str, grid: VoxelGrid, expected: VoxelGrid) -> None:
@@ -38,12 +53,6 @@ def require_own(agent_id: str, named: str, grid: VoxelGrid, expected: VoxelGrid)
         raise errors.NotPermittedError(f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(named)}")
     if grid != expected:
         raise errors.MismatchError(f"voxel size: this mission votes on {expected.size_m:g} m, got {grid.size_m:g} m")
-
-
-# no agent can have an empty id
-_CLOCK = "", "mission-clock"
-_SAVE_INTERVAL_S = 60.0
-_LONGEST_PAUSE_S = 86_400.0
 
 
 class MissionClock:
@@ -145,33 +154,17 @@ class UpdateChecks:
         return self._quotas.kappa_at_join + int(self._quotas.kappa_per_second * elapsed_s)
 
 
-SLICE_VOXELS = 2048
-"""A larger message is stored in parts of this size, so that it does not delay the other agents."""
-_MESSAGE_BYTES = 1024
-"""The cost of a message beside its content."""
-_MAX_PENDING, _AGENT_BYTES = 64, 4 << 20
-"""Of one agent; a robot waits for each acknowledgement, so it has one or two."""
-_TOTAL_BYTES = 64 << 20
-_GROUP_BYTES = 1 << 19
-"""Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
-_LATE_S, _LATE_LOG_S = 2.0, 10.0
-_log = logging.getLogger(__name__)
-
-
 @dataclass(slots=True, eq=False)
 class PendingUpdate:
-    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices.
-
-    future: has its outcome, or its content where it is only decoded.
-    """
+    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices."""
 
     session_id: str
     agent_id: str
     message: bytes | EncodedSubset
-    future: Future[Any] = field(default_factory=Future)
-    next_voxel: int = 0
+    future: Future[Any] = field(default_factory=Future)  # has its outcome, or its content where it is only decoded
+    next_voxel: int = 0  # the first one that is not stored yet
     outcomes: list[PutOutcome] = field(default_factory=list)
-    queued_s: float = field(default_factory=time.monotonic)
+    queued_s: float = field(default_factory=time.monotonic)  # arrival, of the monotonic clock
 
     def __post_init__(self) -> None:
         # a client that disconnects cannot cancel it any more: the message is stored in any case

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows, group_by_voxel
+from gausslite.domain.voxels import VoxelBatch, gather_rows
 from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 
 
@@ -53,13 +53,6 @@ class FusedMap:
     def gaussians(self) -> Gaussians:
         """The fused map, sorted by voxel."""
         return self.batch.gaussians
-
-    def won_by(self, agent_id: str) -> Bool[ndarray, " v"]:
-        """True for the voxels this agent wins."""
-        winners = self.vote.winners
-        is_agent = np.array([name == agent_id for name in winners.agents], np.bool_)
-        won: Bool[ndarray, " v"] = is_agent[winners.agent_index]
-        return won
 
 
 def rank_voxels(table: VoxelScoreTable) -> VoteResult:
@@ -110,12 +103,3 @@ def _stack(batch_by_agent: Mapping[str, VoxelBatch]) -> tuple[VoxelScoreTable, G
     starts = np.cumsum(scores["counts"], dtype=np.int64) - scores["counts"]
     gaussians = Gaussians.concatenate([batch.gaussians for batch in batches])
     return VoxelScoreTable(agents, agent_index, scores), gaussians, starts
-
-
-def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:
-    """Return the fused map: each voxel holds the Gaussians of the agent with the highest Σkappa there (Sec. III-E).
-
-    maps: the complete map of each agent id.
-    Raises InvalidInputError if a mean is outside the grid.
-    """
-    return fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -11,45 +11,12 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.fusion.frames import FrameAlignment
+from gausslite.fusion.moved_voxels import PAIRS, MovedVoxels, Pairs
 from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 from gausslite.fusion.store import FusionStore
 
 SLICE_VOXELS = 128
-_Cells = dict[int, tuple[int, int]]
-"""Σkappa and number of Gaussians by voxel of the fused grid."""
-
-
-class _MovedVoxels:
-    """Where the voxels of an agent in another frame lie in the fused grid: a voxel has parts of several.
-
-    Voxels that are not in the index are used as sent; a quarantined voxel is in it, without cells.
-    """
-
-    def __init__(self) -> None:
-        self.cells_of: dict[int, _Cells] = {}
-        self.sources_of: dict[int, set[int]] = {}
-
-    def replace(self, source: int, cells: _Cells | None) -> set[int]:
-        """Replace the cells of one voxel, None if it is used as sent; returns the fused voxels that may change."""
-        before = self.cells_of.pop(source, None)
-        # without an entry, the voxel was used as sent
-        changed = {source} if before is None or cells is None else set()
-        for cell in before or ():
-            changed.add(cell)
-            self.sources_of[cell].discard(source)
-            if not self.sources_of[cell]:
-                del self.sources_of[cell]
-        if cells is not None:
-            self.cells_of[source] = cells
-            for cell in cells:
-                changed.add(cell)
-                self.sources_of.setdefault(cell, set()).add(source)
-        return changed
-
-    def totals(self, cell: int) -> tuple[int, int]:
-        """Return Σkappa and number of Gaussians of a voxel of the fused grid."""
-        parts = [self.cells_of[source][cell] for source in self.sources_of[cell]]
-        return sum(kappa for kappa, _ in parts), sum(count for _, count in parts)
+_NO_KEYS = np.zeros(0, np.int64)
 
 
 class VoteInput:
@@ -64,7 +31,7 @@ class VoteInput:
         self._store, self._grid = store, grid
         # of the agents whose updates are not used as sent
         self._frames: dict[str, FrameAlignment] = {}
-        self._moved: dict[str, _MovedVoxels] = {}
+        self._moved: dict[str, MovedVoxels] = {}
         for agent_id, alignment in frames.items():
             self.set_frame(agent_id, alignment)
         for agent_id in self._frames:
@@ -102,12 +69,11 @@ class VoteInput:
             return self._store.batch(agent_id, keys)
         if keys is None:
             as_sent = self._store.batch(agent_id)
-            as_sent = select_voxels(as_sent, ~np.isin(as_sent.keys, _array(moved.cells_of)))
+            as_sent = select_voxels(as_sent, ~moved.has(as_sent.keys))
         else:
-            as_sent = self._store.batch(agent_id, _array(set(keys.tolist()) - moved.cells_of.keys()))
-        cells = list(moved.sources_of) if keys is None else [key for key in keys.tolist() if key in moved.sources_of]
-        sources = set().union(*(moved.sources_of[cell] for cell in cells))
-        found = select_keys(self._move(agent_id, _array(sources)), _array(cells))
+            as_sent = self._store.batch(agent_id, np.unique(keys[~moved.has(keys)]))
+        pairs = moved.pairs(keys)
+        found = select_keys(self._move(agent_id, np.unique(pairs["sources"])), np.unique(pairs["cells"]))
         both = np.isin(as_sent.keys, found.keys)
         if not both.any():
             return merge_batches(as_sent, found)
@@ -130,29 +96,27 @@ class VoteInput:
         alignment = self._frames.get(agent_id)
         if alignment is None and agent_id not in self._moved:
             return sources
-        moved = self._moved.setdefault(agent_id, _MovedVoxels())
-        changed: set[int] = set()
+        moved = self._moved.setdefault(agent_id, MovedVoxels())
         if alignment is None:
-            for source in sources.tolist():
-                changed |= {source} | moved.replace(source, None)
-            if not moved.cells_of:
+            changed = np.union1d(sources, moved.remove(sources))
+            if moved.is_empty:
                 del self._moved[agent_id]
-            return _array(changed)
-        cells_of: dict[int, _Cells] = {source: {} for source in sources.tolist()}
+            return changed
+        pairs = np.zeros(0, PAIRS)
         if alignment.is_used:
             batch = self._store.batch(agent_id, sources)
             gaussians = self._gaussians_in_frame(agent_id, batch)
             rows = np.flatnonzero(self._in_range(gaussians))
-            for source, cell, kappa, count in _totals_by_cell(batch, gaussians.take(rows), rows, self._grid):
-                cells_of[source][cell] = kappa, count
-        for source, cells in cells_of.items():
-            changed |= moved.replace(source, cells)
-        return _array(changed)
+            pairs = _totals_by_cell(batch, gaussians.take(rows), rows, self._grid)
+        return moved.replace(sources, pairs)
 
     def leave_out(self, agent_id: str, sources: Int64[ndarray, " a"]) -> Int64[ndarray, " k"]:
         """Use nothing of these voxels until they are moved; returns the fused voxels that may change."""
-        moved = self._moved.setdefault(agent_id, _MovedVoxels())
-        return _array(set().union(*(moved.replace(source, {}) for source in sources.tolist())))
+        return self._moved.setdefault(agent_id, MovedVoxels()).replace(sources, np.zeros(0, PAIRS))
+
+    def memory_bytes(self, agent_id: str) -> int:
+        """Return the memory that the agent's moved voxels take."""
+        return self._moved[agent_id].memory_bytes if agent_id in self._moved else 0
 
     def begin_map(self, agent_id: str, moved: Sequence[str], dropped: Sequence[str]) -> str:
         """Begin another map of an agent; as FusionStore.begin_map. Raises StorageError."""
@@ -169,7 +133,7 @@ class VoteInput:
         """Delete the agent's frame and its moved voxels; returns these."""
         self._frames.pop(agent_id, None)
         moved = self._moved.pop(agent_id, None)
-        return _array(() if moved is None else moved.sources_of)
+        return _NO_KEYS if moved is None else np.unique(moved.pairs(None)["cells"])
 
     def _move(self, agent_id: str, sources: Int64[ndarray, " s"]) -> VoxelBatch:
         gaussians = self._gaussians_in_frame(agent_id, self._store.batch(agent_id, sources))
@@ -197,46 +161,44 @@ class VoteInput:
         return inside
 
     def _with_moved(
-        self, table: VoxelScoreTable, index: int, moved: _MovedVoxels, keys: Int64[ndarray, " k"] | None
+        self, table: VoxelScoreTable, index: int, moved: MovedVoxels, keys: Int64[ndarray, " k"] | None
     ) -> VoxelScoreTable:
         """Return the table with the agent's moved voxels in place of those of the index."""
-        wanted = moved.sources_of if keys is None else [key for key in keys.tolist() if key in moved.sources_of]
-        totals = {key: moved.totals(key) for key in wanted}
-        kept = np.ones(len(table), np.bool_)
+        pairs = moved.pairs(keys)
+        cells, at = np.unique(pairs["cells"], return_inverse=True)
+        scores = np.zeros(len(cells), SCORES)
+        scores["keys"] = cells
+        np.add.at(scores["kappa_sums"], at, pairs["kappas"])
+        np.add.at(scores["counts"], at, pairs["counts"])
         own = np.flatnonzero(table.agent_index == index)
-        for place, (key, _, kappa, count, _) in zip(own.tolist(), table.scores[own].tolist(), strict=True):
-            kept[place] = key not in moved.cells_of and key not in totals
-            if key in totals and key not in moved.cells_of and count:
-                # as sent, beside what other voxels have there
-                totals[key] = totals[key][0] + kappa, totals[key][1] + count
-        scores = np.zeros(len(totals), SCORES)
-        scores["keys"] = list(totals)
-        scores["kappa_sums"], scores["counts"] = np.array(list(totals.values()), np.uint64).reshape(-1, 2).T
+        as_sent = table.scores[own]
+        is_shared = np.isin(as_sent["keys"], cells)
+        is_sent = ~moved.has(as_sent["keys"])
+        # as sent, beside what other voxels have there
+        shared = as_sent[is_shared & is_sent & (as_sent["counts"] > 0)]
+        for field in ("kappa_sums", "counts"):
+            scores[field][cells.searchsorted(shared["keys"])] += shared[field]
+        kept = np.ones(len(table), np.bool_)
+        kept[own] = is_sent & ~is_shared
         changed = VoxelScoreTable(
             table.agents,
-            np.append(table.agent_index[kept], np.full(len(totals), index, np.int32)),
+            np.append(table.agent_index[kept], np.full(len(cells), index, np.int32)),
             np.concatenate([table.scores[kept], scores]),
         )
         return changed.take(np.lexsort((changed.scores["keys"], changed.agent_index)))
 
 
-def _totals_by_cell(
-    batch: VoxelBatch, moved: Gaussians, rows: Int64[ndarray, " n"], grid: VoxelGrid
-) -> Iterator[tuple[int, int, int, int]]:
-    """Yield source voxel, fused voxel, Σkappa and number of Gaussians of each pair; rows: the Gaussians in the batch"""
-    if len(rows) == 0:
-        return
+def _totals_by_cell(batch: VoxelBatch, moved: Gaussians, rows: Int64[ndarray, " n"], grid: VoxelGrid) -> Pairs:
+    """Return the pairs of source and fused voxel with their totals; rows: the moved Gaussians' rows in the batch."""
     sources, cells = np.repeat(batch.keys, batch.counts)[rows], grid.keys(moved.means_m)
     order = np.lexsort((cells, sources))
     sources, cells = sources[order], cells[order]
     is_first = np.ones(len(order), np.bool_)
     is_first[1:] = (sources[1:] != sources[:-1]) | (cells[1:] != cells[:-1])
     starts = np.flatnonzero(is_first)
-    sums = np.add.reduceat(moved.kappa[order], starts, dtype=np.uint64)
-    counts = np.diff(starts, append=len(order))
-    yield from zip(sources[starts].tolist(), cells[starts].tolist(), sums.tolist(), counts.tolist(), strict=True)
-
-
-def _array(keys: Iterable[int]) -> Int64[ndarray, " k"]:
-    """Return these voxel keys, ascending."""
-    return np.array(sorted(keys), np.int64)
+    pairs = np.zeros(len(starts), PAIRS)
+    if len(starts):
+        pairs["sources"], pairs["cells"] = sources[starts], cells[starts]
+        pairs["kappas"] = np.add.reduceat(moved.kappa[order], starts, dtype=np.uint64)
+        pairs["counts"] = np.diff(starts, append=len(order))
+    return pairs

@@ -15,6 +15,7 @@ from numpy import ndarray
 from gausslite.datasets.files import resize_depth
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.render.rasterizer import NEAR_M
 
@@ -44,7 +45,7 @@ class DepthView:
     camera: Camera
     T_camera_world: Float64[ndarray, "4 4"]
     depth_m: Float32[ndarray, "h w"]
-    nearest_m: Float32[ndarray, "h w"]
+    nearest_m: Float32[ndarray, "h w"]  # least depth around a pixel, so that nothing beside a border is seen through
 
     @cached_property
     def farthest_m(self) -> Float32[ndarray, "h w"]:
@@ -136,6 +137,13 @@ def seen_through(
     """Return the points that these views contradict: enough see through them, and few show a surface there."""
     through, shown = view_counts(points_m, views)
     return (through >= min_views) & (through >= _MIN_RATIO * shown)
+
+
+def without_guesses(gaussians: Gaussians, frames: Iterable[Frame]) -> Gaussians:
+    """Return a map for others: without untrained Gaussians whose distance is a guess of 4 m or more."""
+    untrained = np.flatnonzero(gaussians.kappa == 0)
+    guessed = has_guessed_depth(gaussians.means_m[untrained], frames)
+    return gaussians.take(np.delete(np.arange(len(gaussians)), untrained[guessed]))
 
 
 def has_guessed_depth(points_m: Float32[ndarray, "n 3"], frames: Iterable[Frame]) -> Bool[ndarray, " n"]:

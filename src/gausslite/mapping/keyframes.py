@@ -25,6 +25,11 @@ from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subse
 
 _ROI_MARGIN_PX = 5
 """Margin around the ROI within which tiles are rendered in the active phase: SSIM's window needs it."""
+_SSIM_WINDOW_PX = 11
+_DEPTH_STEP_PX = 8
+_ALL_MEASURED = 0.999
+_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
+"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
 
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
@@ -95,29 +100,16 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
     return RelevanceMap(pixel_weights, get_array(state, "target", frame.depth_m.shape, np.int16).copy(), known_objects)
 
 
-_SSIM_WINDOW_PX = 11
-_DEPTH_STEP_PX = 8
-_ALL_MEASURED = 0.999
-_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
-"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frame with its per-pixel relevance to the task (Sec. III-B).
+    """A frame with its per-pixel relevance to the task (Sec. III-B)."""
 
-    recorded: the frame with the source's pose and colours, if `frame` has refined ones; otherwise None.
-    evaluated: False until the relevance to the present task is known; `relevance` is empty until then. anchor: number
-    of the keyframe that the frame follows when poses are corrected; its own one, if it is a keyframe. hidden: pixels
-    that showed what has moved since; None if there are none.
-    """
-
-    frame: Frame
+    frame: Frame  # with the pose and the exposure as refined
     relevance: RelevanceMap
-    recorded: Frame | None = None
-    evaluated: bool = True
-    anchor: int = 0
-    hidden: Bool[ndarray, "h w"] | None = None
+    recorded: Frame | None = None  # with the source's pose and colours, if `frame` has refined ones
+    evaluated: bool = True  # False until the relevance to the present task is known; `relevance` is empty until then
+    anchor: int = 0  # number of the keyframe that it follows when poses are corrected; its own, if it is one
+    hidden: Bool[ndarray, "h w"] | None = None  # pixels that showed what has moved since; None if there are none
 
     def with_relevance(self, relevance: RelevanceMap) -> Keyframe:
         """Return the keyframe evaluated with this relevance; what has moved since is not relevant."""
@@ -186,16 +178,13 @@ def motion_blur_px(frame: Frame) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowView:
-    """A keyframe prepared for training. roi: the 16x16 tiles that touch the ROI or its margin.
-
-    half_view: the image in half size, with which iterations on whole images train; None: they use the training_view.
-    """
+    """A keyframe prepared for training."""
 
     keyframe: Keyframe
-    training_view: TrainingView
-    half_view: TrainingView | None
+    training_view: TrainingView  # prepared by the rasterizer, whole or masked to the ROI's tiles
+    half_view: TrainingView | None  # in half size, for iterations on whole images; None: they use training_view
     T_camera_world: Float64[ndarray, "4 4"]
-    roi: Subset
+    roi: Subset  # the 16x16 tiles that touch the ROI or its margin
 
     @property
     def shows_roi(self) -> bool:

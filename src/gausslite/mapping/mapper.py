@@ -11,7 +11,7 @@ from numpy import ndarray
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.frame import Frame, FrameId
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
@@ -28,17 +28,17 @@ from gausslite.domain.state import (
 )
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
-from gausslite.mapping.free_space import contradicted_rows, has_guessed_depth, rows_moved_away
+from gausslite.mapping.free_space import contradicted_rows, rows_moved_away
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.moving import MOTION_REFERENCES, moving_pixels, without_pixels
-from gausslite.mapping.pose_corrector import LoopCounts, PoseCorrector
+from gausslite.mapping.pose_corrector import PoseCorrector
 from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
 from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_roi_evidence
-from gausslite.mapping.training import CountedScheduler, SkippableStage, Stage, StageScheduler, Trainer
+from gausslite.mapping.training import SkippableStage, Stage, StageScheduler, Trainer
 from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
@@ -51,35 +51,31 @@ _EXTENT_PER_DEPTH = 1.0 / 3.0
 
 @dataclass(frozen=True, slots=True)
 class MappedFrame:
-    """Result of mapping one frame: Gaussians added by seeding, iterations, and Gaussians in the map afterwards.
-
-    skipped: why the frame was not mapped, or None. T_world_camera: the pose that it was mapped with; None if skipped.
-    anchor: number of the keyframe that it follows. T_corrected_earlier: motion of each keyframe, in world axes, if a
-    loop corrected the map after this frame.
-    """
+    """Result of mapping one frame."""
 
     index: int
-    seeded: int
-    iterations: int
-    gaussians: int
-    skipped: str | None = None
-    T_world_camera: Float64[ndarray, "4 4"] | None = None
-    anchor: int = 0
-    T_corrected_earlier: Float64[ndarray, "k 4 4"] | None = None
+    seeded: int  # Gaussians added by seeding
+    iterations: int  # of training
+    gaussians: int  # in the map afterwards
+    skipped: str | None = None  # why the frame was not mapped, or None
+    T_world_camera: Float64[ndarray, "4 4"] | None = None  # the pose that it was mapped with; None if skipped
+    anchor: int = 0  # number of the keyframe that it follows
+    T_corrected_earlier: Float64[ndarray, "k 4 4"] | None = None  # motion of each keyframe, world axes, by a loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameView:
-    """A frame to map, with its pose, and the map rendered from there: None if it is empty or was not rendered."""
+    """A frame to map, and what the map shows from its pose."""
 
     frame: Frame
-    rendered: RenderedView | None = None
+    rendered: RenderedView | None = None  # None if the map is empty or was not rendered
 
 
 class GaussianMapper:
     """Owner of one growing Gaussian map. Not thread-safe.
 
-    poses: of all mapped frames. store: the keyframes.
+    table: the Gaussians. poses: of all mapped frames. store: the keyframes. corrector: of loops, or None. revision:
+    number of frames that changed the map.
 
     Equal settings, seed and frames give bit-identical maps if the rasterizer is deterministic.
     """
@@ -99,7 +95,7 @@ class GaussianMapper:
         self.settings = settings
         self._rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
-        self._table = SplatTable(settings.max_gaussians)
+        self.table = SplatTable(settings.max_gaussians)
         self._has_prior = False
         if initial_map is not None:
             self.continue_map(initial_map)
@@ -110,10 +106,10 @@ class GaussianMapper:
         )
         self.poses = PoseTable()
         self._refiner = open_refiner(refinement, self.render, self.poses)
-        self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
-        self._corrector = corrector
+        self._trainer = Trainer(settings, self.table, rasterizer, self._rng)
+        self.corrector = corrector
         self._extent_m = 0.0
-        self._revision = 0
+        self.revision = 0
         self._skipped = 0
 
     def continue_map(self, earlier: Gaussians) -> None:
@@ -121,22 +117,12 @@ class GaussianMapper:
 
         Raises QuotaError if it exceeds the cap.
         """
-        self._table.append(earlier)
+        self.table.append(earlier)
         self._has_prior = True
-
-    @property
-    def count(self) -> int:
-        """Gaussians in the map."""
-        return self._table.count
-
-    @property
-    def revision(self) -> int:
-        """Number of frames that changed the map."""
-        return self._revision
 
     def look(self, frame: Frame, scheduler: StageScheduler) -> FrameView:
         """Return the frame with the map rendered from its pose, unless the scheduler skips seeding."""
-        if self.count == 0 or scheduler.skips(SkippableStage.SEEDING):
+        if self.table.count == 0 or scheduler.skips(SkippableStage.SEEDING):
             return FrameView(frame)
         with scheduler.timing(Stage.RENDERING):
             rendering = self.render(frame.camera, frame.T_world_camera, frame.motion)
@@ -144,19 +130,15 @@ class GaussianMapper:
 
     def leave_out_moving(self, view: FrameView, scheduler: StageScheduler) -> FrameView:
         """Return the view without the things that move; what has moved since an earlier keyframe is hidden there."""
-        count, frame = self.count, view.frame
+        count, frame = self.table.count, view.frame
         moving = self._find_moving(frame)
-        if view.rendered is None or self.count != count:
+        if view.rendered is None or self.table.count != count:
             view = self.look(frame, scheduler)
         if moving is None:
             return view
         with scheduler.timing(Stage.RENDERING):
             seen = view.rendered or self.render(frame.camera, frame.T_world_camera, frame.motion)
         return replace(view, frame=without_pixels(frame, moving, seen.rgb))
-
-    def map_frame(self, frame: Frame, relevance: RelevanceMap, scheduler: StageScheduler | None = None) -> MappedFrame:
-        """Map a frame as it is, with things that move; see `map_view`."""
-        return self.map_view(FrameView(frame), relevance, scheduler or CountedScheduler())
 
     def map_view(self, looked: FrameView, relevance: RelevanceMap, scheduler: StageScheduler) -> MappedFrame:
         """Seed and train the map with one frame; the scheduler limits the time.
@@ -168,36 +150,29 @@ class GaussianMapper:
         require_array("relevance pixel_weights", relevance.pixel_weights, frame.depth_m.shape, np.float32)
         if defect := frame.defect:
             self._skipped += 1
-            return MappedFrame(frame.index, 0, 0, self.count, defect)
-        self.poses.add(frame, self.store.next_anchor)
-        self._refine_keyframes(scheduler)
-        with scheduler.timing(Stage.VIEW_PREPARATION):
-            view = self._prepare_view(frame, relevance)
-        self.poses.refine(frame.id, view.keyframe.frame.T_world_camera)
-        seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, looked.rendered, scheduler)
-        motions = self._close_loop(frame, view.keyframe, scheduler) if self.store.next_is_keyframe else None
-        if motions is not None:
-            view = self._window_view(view.keyframe.moved(motions))
-        iterations = self._train(view, motions, scheduler)
+            return MappedFrame(frame.index, 0, 0, self.table.count, defect)
         is_keyframe = self.store.next_is_keyframe
-        self.store.add(view)
+        self.poses.add(frame, self.store.next_anchor)
+        self._refine_keyframes(scheduler)  # earlier poses first: the map has been trained since
+        view = self._prepare_view(frame, relevance, scheduler)  # the paper's poses are exact, a robot's are not
+        seeded = self._seed(view.keyframe, looked.rendered, scheduler)  # N seeds: SB, SIS with Eq. (1), GFD
+        motions = self._close_loop(frame, view.keyframe, scheduler) if is_keyframe else None
+        if motions is not None:  # before training, which would pull the map to the wrong place
+            view = self._window_view(view.keyframe.moved(motions))
+        iterations = self._train(view, motions, scheduler)  # ROI and MVO with Eq. (2); counts kappa
+        self.store.add(view)  # only now: the window has the current view besides
         if self._has_prior and is_keyframe:
             self._update_prior(view.keyframe)
-        self._revision += 1
+        self.revision += 1
         return MappedFrame(
             frame.index,
             seeded,
             iterations,
-            self.count,
+            self.table.count,
             T_world_camera=view.keyframe.frame.T_world_camera,
             anchor=view.keyframe.anchor,
             T_corrected_earlier=motions,
         )
-
-    @property
-    def loops(self) -> LoopCounts:
-        """What became of the loops so far."""
-        return LoopCounts() if self._corrector is None else self._corrector.counts
 
     def idle_step(self) -> bool:
         """Run one iteration on the window's keyframes. Return False if there are none yet."""
@@ -206,22 +181,12 @@ class GaussianMapper:
         self._trainer.idle_step(self.store.window, self._extent_m)
         return True
 
-    def update_relevance(self, frame: FrameId, relevance: RelevanceMap) -> None:
-        """Replace the relevance of an earlier frame, if its keyframe is still kept."""
-        keyframe = self.store.get(frame)
-        if keyframe is None:
-            return
-        if keyframe.evaluated:
-            self.store.replace(keyframe.with_relevance(relevance), self._window_view)
-        else:
-            self.evaluate_keyframe(keyframe, relevance)
-
     def reset_roi(self) -> None:
         """Start a new task: no Gaussian is active, and no keyframe is evaluated.
 
         The map, kappa and the optimiser state stay; the old ROI is evicted first if the cap is reached.
         """
-        clear_roi(self._table)
+        clear_roi(self.table)
         self.store.reset_roi()
         self._trainer.reset_roi()
 
@@ -231,11 +196,14 @@ class GaussianMapper:
         Gaussians that the keyframe shows inside the ROI become active. ROI pixels with too few of them are seeded,
         within the cap. None: the relevance cannot be found; the keyframe shows no ROI and adds no evidence.
         """
+        if keyframe.evaluated and relevance is not None:  # a late detection: the frame has given its evidence before
+            self.store.replace(keyframe.with_relevance(relevance), self._window_view)
+            return 0
         if relevance is None:
             self.store.replace(keyframe.with_relevance(keyframe.relevance), None)
             return 0
         require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
-        table, evaluated = self._table, keyframe.with_relevance(relevance)
+        table, evaluated = self.table, keyframe.with_relevance(relevance)
         self.store.replace_relevance(evaluated, self._window_view)
         update_roi_evidence(table, evaluated.frame, evaluated.relevance)
         if not evaluated.relevance.roi.any():
@@ -255,59 +223,48 @@ class GaussianMapper:
             self.store.replace(completed, None)
             return 0
         self.store.replace_relevance(completed, self._window_view)
-        add_roi_evidence(self._table, keyframe.frame, completed.relevance, added)
-        seeds = self._seeder.seed_roi(keyframe.frame, added, self._table.means_m[self._table.active])
+        add_roi_evidence(self.table, keyframe.frame, completed.relevance, added)
+        seeds = self._seeder.seed_roi(keyframe.frame, added, self.table.means_m[self.table.active])
         return self._insert(Seeds(seeds, Gaussians.empty(), keyframe.anchor))
 
     def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:
         """Insert a teammate's voxels whose Σkappa exceeds the local one; they replace the local Gaussians there."""
-        inserted = insert_team_voxels(self._table, received, grid)
-        self._revision += inserted.gaussians > 0
+        inserted = insert_team_voxels(self.table, received, grid)
+        self.revision += inserted.gaussians > 0
         return inserted
 
     def render(
         self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
     ) -> Rendering:
         """Render the map from a pose, with a moving camera if motion is given."""
-        return self._rasterizer.forward(self._table.rows, camera, inverse(T_world_camera), motion=motion)
+        return self._rasterizer.forward(self.table.rows, camera, inverse(T_world_camera), motion=motion)
 
     def gaussians(self, active_only: bool = False) -> Gaussians:
         """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0."""
-        rows = np.flatnonzero(self._table.active) if active_only else None
-        return self._table.to_gaussians(rows, use_ema=self.settings.optimization.ema_updates > 0)
-
-    def shared_gaussians(self) -> Gaussians:
-        """Return a copy of the map for others: without untrained Gaussians whose distance is a guess of 4 m or more."""
-        gaussians = self.gaussians()
-        untrained = np.flatnonzero(gaussians.kappa == 0)
-        guessed = has_guessed_depth(gaussians.means_m[untrained], (keyframe.frame for keyframe in self.store.kept))
-        return gaussians.take(np.delete(np.arange(len(gaussians)), untrained[guessed]))
-
-    def keyframes(self) -> list[Keyframe]:
-        """Return the keyframes kept of the whole mission and those that train the map, by capture time (Sec. III-E)."""
-        return list(self.store.kept)
+        rows = np.flatnonzero(self.table.active) if active_only else None
+        return self.table.to_gaussians(rows, use_ema=self.settings.optimization.ema_updates > 0)
 
     def memory_mib(self) -> dict[str, float]:
         """Return the memory in MiB of the table, of Adam's moments and of the keyframes' images."""
         return {
-            "table": self._table.table_bytes / 2**20,
-            "optimizer": self._table.optimizer_bytes / 2**20,
+            "table": self.table.table_bytes / 2**20,
+            "optimizer": self.table.optimizer_bytes / 2**20,
             "keyframes": self.store.image_bytes / 2**20,
         }
 
     def state(self) -> State:
         """Return everything that the next frame depends on, as views that are valid until then."""
         return {
-            **add_prefix("table", self._table.state()),
+            **add_prefix("table", self.table.state()),
             **add_prefix("keyframes", self.store.state()),
             **add_prefix("trainer", self._trainer.state()),
             **add_prefix("refiner", {} if self._refiner is None else self._refiner.state()),
             **add_prefix("refiner/history", self.poses.state()),
-            **add_prefix("loops", {} if self._corrector is None else self._corrector.state()),
+            **add_prefix("loops", {} if self.corrector is None else self.corrector.state()),
             **({} if self.poses.T_corrected_odometry is None else {_CORRECTED: self.poses.T_corrected_odometry}),
             "generator": generator_state(self._rng),
             "extent_m": np.array([self._extent_m]),
-            "frames": int_array(self._revision, self._skipped, self._has_prior),
+            "frames": int_array(self.revision, self._skipped, self._has_prior),
         }
 
     def restore(self, state: State) -> None:
@@ -316,19 +273,19 @@ class GaussianMapper:
         Raises MapFileError if the state is not valid, QuotaError if it exceeds max_gaussians. Do not use the mapper
         after an error.
         """
-        self._table.restore(select_prefix(state, "table"))
+        self.table.restore(select_prefix(state, "table"))
         self.store.restore(select_prefix(state, "keyframes"), self._window_view)
         self._trainer.restore(select_prefix(state, "trainer"))
         if self._refiner is not None:
             self._refiner.restore(select_prefix(state, "refiner"))
         self.poses.restore(select_prefix(state, "refiner/history"))
-        if self._corrector is not None:
-            self._corrector.restore(select_prefix(state, "loops"))
+        if self.corrector is not None:
+            self.corrector.restore(select_prefix(state, "loops"))
         if _CORRECTED in state:
             self.poses.T_corrected_odometry = get_array(state, _CORRECTED, (4, 4), np.float64).copy()
         restore_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
         [self._extent_m] = get_floats(state, "extent_m", 1)
-        self._revision, self._skipped, has_prior = get_counts(state, "frames", 3)
+        self.revision, self._skipped, has_prior = get_counts(state, "frames", 3)
         self._has_prior = bool(has_prior)
         self._require_known_anchors()
 
@@ -336,25 +293,27 @@ class GaussianMapper:
         """Raise MapFileError if a restored Gaussian, keyframe or pose follows an unknown keyframe."""
         count = self.store.count
         anchors = [keyframe.anchor for keyframe in self.store.kept]
-        newest = max([int(self._table.anchor.max(initial=NO_ANCHOR)), self.poses.newest_anchor, *anchors])
-        if newest >= count or self._table.anchor.min(initial=0) < NO_ANCHOR or count > _MAX_KEYFRAMES:
+        newest = max([int(self.table.anchor.max(initial=NO_ANCHOR)), self.poses.newest_anchor, *anchors])
+        if newest >= count or self.table.anchor.min(initial=0) < NO_ANCHOR or count > _MAX_KEYFRAMES:
             raise MapFileError(f"state anchors: expected the numbers of {count} keyframes, got others")
-        if self._corrector is not None and self._corrector.keyframes != count:
-            raise MapFileError(f"state loops: expected {count} keyframes, got {self._corrector.keyframes}")
+        if self.corrector is not None and self.corrector.keyframes != count:
+            raise MapFileError(f"state loops: expected {count} keyframes, got {self.corrector.keyframes}")
 
-    def _prepare_view(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
+    def _prepare_view(self, frame: Frame, relevance: RelevanceMap, scheduler: StageScheduler) -> WindowView:
         """Prepare the frame for training; refine its pose and exposure if the prior allows an error."""
-        # beyond max_depth_m nothing is seeded, and one outlier would enlarge the extent for the whole mission
-        largest_depth_m = min(float(frame.depth_m.max()), self.settings.seeding.max_depth_m)
-        self._extent_m = max(self._extent_m, largest_depth_m * _EXTENT_PER_DEPTH)
-        anchor = self.store.next_anchor
-        if self._refiner is None or self._table.count == 0:
-            return self._window_view(Keyframe(frame, relevance, anchor=anchor))
-        return self._window_view(Keyframe(self._refiner.refine(frame), relevance, recorded=frame, anchor=anchor))
+        with scheduler.timing(Stage.VIEW_PREPARATION):
+            # beyond max_depth_m nothing is seeded, and one outlier would enlarge the extent for the whole mission
+            largest_depth_m = min(float(frame.depth_m.max()), self.settings.seeding.max_depth_m)
+            self._extent_m = max(self._extent_m, largest_depth_m * _EXTENT_PER_DEPTH)
+            keyframe = Keyframe(frame, relevance, anchor=self.store.next_anchor)
+            if self._refiner is not None and self.table.count:
+                keyframe = replace(keyframe, frame=self._refiner.refine(frame), recorded=frame)
+            self.poses.refine(frame.id, keyframe.frame.T_world_camera)
+            return self._window_view(keyframe)
 
     def _refine_keyframes(self, scheduler: StageScheduler) -> None:
         """Refine the next keyframes against the map, while there is time and the prior allows an error."""
-        if self._refiner is None or self._table.count == 0:
+        if self._refiner is None or self.table.count == 0:
             return
         for keyframe in self._refiner.next_keyframes(self.store.window):
             if not scheduler.has_time_for(Stage.KEYFRAME_REFINEMENT):
@@ -368,12 +327,12 @@ class GaussianMapper:
         frames = [keyframe.frame for keyframe in keyframes]
         if keyframes:
             # one keyframe with each frame
-            chosen = self._revision % len(keyframes)
+            chosen = self.revision % len(keyframes)
             later = [*frames[chosen + 1 :], frame]
             moved = moving_pixels(frames[chosen], later)
             if moved.any():
                 contradicting = [*frames[:chosen], *later]
-                self._table.remove(rows_moved_away(self._table.means_m, frames[chosen], moved, contradicting))
+                self.table.remove(rows_moved_away(self.table.means_m, frames[chosen], moved, contradicting))
                 rendered = self.render(frames[chosen].camera, frames[chosen].T_world_camera, frames[chosen].motion)
                 self.store.replace(keyframes[chosen].hide(moved, rendered.rgb), self._window_view)
         moving = moving_pixels(frame, frames)
@@ -386,14 +345,14 @@ class GaussianMapper:
 
         prior: the frame with the pose before refinement.
         """
-        if self._corrector is None:
+        if self.corrector is None:
             return None
         search = scheduler.has_time_for(Stage.LOOP_CLOSURE)
         with scheduler.timing(Stage.LOOP_CLOSURE):
-            motions = self._corrector.add(keyframe, prior, self.store.kept if search else (), self._table)
+            motions = self.corrector.add(keyframe, prior, self.store.kept if search else (), self.table)
             if motions is None:
                 return None
-            move_with_anchors(self._table, motions)
+            move_with_anchors(self.table, motions)
             self.store.move(motions)
             self.poses.move(motions)
             return motions
@@ -403,7 +362,9 @@ class GaussianMapper:
 
     def _seed(self, keyframe: Keyframe, rendered: RenderedView | None, scheduler: StageScheduler) -> int:
         """Add Gaussians where the map does not explain the frame (Sec. III-C); return how many."""
-        frame, table = keyframe.frame, self._table
+        if scheduler.skips(SkippableStage.SEEDING):
+            return 0
+        frame, table = keyframe.frame, self.table
         # rendered from the pose before refinement
         if (rendered is None or keyframe.recorded is not None) and table.count:
             rendered = RenderedView.from_rendering(self.render(frame.camera, frame.T_world_camera, frame.motion))
@@ -416,13 +377,13 @@ class GaussianMapper:
 
     def _update_prior(self, keyframe: Keyframe) -> None:
         """Set the active flags of what a keyframe shows, and remove the Gaussians that the keyframes see through."""
-        update_roi_evidence(self._table, keyframe.frame, keyframe.relevance)
+        update_roi_evidence(self.table, keyframe.frame, keyframe.relevance)
         frames = (earlier.frame for earlier in self.store.buffer)
-        self._table.remove(contradicted_rows(self._table.means_m, keyframe.frame, frames))
+        self.table.remove(contradicted_rows(self.table.means_m, keyframe.frame, frames))
 
     def _insert(self, seeds: Seeds) -> int:
         """Add seeds within the cap; return how many."""
-        seeding, table = self.settings.seeding, self._table
+        seeding, table = self.settings.seeding, self.table
         min_background = int(seeding.background_share * table.capacity)
         return insert_seeds(table, seeds, seeding.opacity, self._rng, min_background)
 

@@ -21,6 +21,30 @@ from gausslite.plugins import Group, load, names
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 NO_TASK = Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
+TASK = "task"
+"""Name of the default policy."""
+UNIFORM = "uniform"
+"""Name of the policy without a region of interest."""
+_PARTS: dict[str, tuple[str, float | bool]] = {
+    **{name: (f"components.{name}", False) for name in ("sb", "mvo", "roi", "sis", "gfd")},
+    "long-term-keyframes": ("keyframes.long_term_keyframes", 0),
+    "roi-context": ("keyframes.roi_context_weight", 0.0),
+    "depth-edge-mask": ("keyframes.depth_edge_px", 0),
+    "depth-fill": ("seeding.fill_depth", False),
+    "background-reserve": ("seeding.background_share", 0.0),
+    "ema": ("optimization.ema_updates", 0.0),
+    "lr-decay": ("optimization.adam.decay_after_updates", math.inf),
+    "saturation": ("saturation.max_released", 0.0),
+    "motion-mask": ("leaves_out_moving", False),
+    "view-rotation": ("keyframes.rotates", False),
+    "active-views": ("optimization.active_views", 1),
+    "half-size": ("keyframes.half_size_from_px", math.inf),
+}
+"""The field of `MapperSettings` that each part of the task policy has, and the field's value without the part."""
+ABLATION_FLAGS = tuple(_PARTS)
+"""All names that `disable` accepts, in the order of the ablation in bench/results."""
+PAPER_FLAGS, EXTENSION_FLAGS = ABLATION_FLAGS[:5], ABLATION_FLAGS[5:]
+"""The paper's components (Sec. III-C, III-D) in the order of its ablation (Table III), and the extensions."""
 
 
 def uniform_policy() -> MapperSettings:
@@ -59,11 +83,6 @@ def paper_policy() -> MapperSettings:
     return disable(published, EXTENSION_FLAGS)
 
 
-TASK = "task"
-"""Name of the default policy."""
-UNIFORM = "uniform"
-"""Name of the policy without a region of interest."""
-
 _CORE: dict[str, Callable[[], MapperSettings]] = {TASK: task_policy, "paper": paper_policy, UNIFORM: uniform_policy}
 POLICIES = (*_CORE, *names(Group.POLICIES))
 """All names; those of packages are the baselines of comparisons."""
@@ -80,29 +99,6 @@ def policy(name: str) -> MapperSettings:
 def follows_task(name: str) -> bool:
     """True if the map of a named policy depends on the task. Raises InvalidInputError."""
     return policy(name).components.follow_task
-
-
-_PARTS: dict[str, tuple[str, float | bool]] = {
-    **{name: (f"components.{name}", False) for name in ("sb", "mvo", "roi", "sis", "gfd")},
-    "long-term-keyframes": ("keyframes.long_term_keyframes", 0),
-    "roi-context": ("keyframes.roi_context_weight", 0.0),
-    "depth-edge-mask": ("keyframes.depth_edge_px", 0),
-    "depth-fill": ("seeding.fill_depth", False),
-    "background-reserve": ("seeding.background_share", 0.0),
-    "ema": ("optimization.ema_updates", 0.0),
-    "lr-decay": ("optimization.adam.decay_after_updates", math.inf),
-    "saturation": ("saturation.max_released", 0.0),
-    "motion-mask": ("leaves_out_moving", False),
-    "view-rotation": ("keyframes.rotates", False),
-    "active-views": ("optimization.active_views", 1),
-    "half-size": ("keyframes.half_size_from_px", math.inf),
-}
-"""The field of `MapperSettings` that each part of the task policy has, and the field's value without the part."""
-
-ABLATION_FLAGS = tuple(_PARTS)
-"""All names that `disable` accepts, in the order of the ablation in bench/results."""
-PAPER_FLAGS, EXTENSION_FLAGS = ABLATION_FLAGS[:5], ABLATION_FLAGS[5:]
-"""The paper's components (Sec. III-C, III-D) in the order of its ablation (Table III), and the extensions."""
 
 
 def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:

@@ -19,18 +19,13 @@ from gausslite.render.rasterizer import Rasterizer
 
 @dataclass(frozen=True, slots=True)
 class LoopCounts:
-    """What became of the loops so far.
+    """What became of the loops so far."""
 
-    refused: keyframes whose image, or the map, did not agree with the pose of a loop. accepted, rejected: loops
-    by the latest solution of the pose graph. withdrawn: accepted by one solution and rejected by a later one.
-    corrections: how often the map moved.
-    """
-
-    refused: int = 0
-    accepted: int = 0
-    rejected: int = 0
-    withdrawn: int = 0
-    corrections: int = 0
+    refused: int = 0  # keyframes whose image, or the map, did not agree with the pose of a loop
+    accepted: int = 0  # loops that the latest solution of the pose graph keeps
+    rejected: int = 0  # loops that it does not keep
+    withdrawn: int = 0  # accepted by one solution and rejected by a later one
+    corrections: int = 0  # how often the map moved
 
     def describe(self) -> str:
         """Return the counts as one line; empty while there is nothing to report."""

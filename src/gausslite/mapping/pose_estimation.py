@@ -24,16 +24,11 @@ RenderMap = Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Ren
 
 @dataclass(frozen=True, slots=True)
 class RefinementSettings:
-    """How views are refined.
+    """How views are refined."""
 
-    prior: standard deviations of pose and exposure errors. keyframes_per_frame: keyframes refined with each frame.
-    anchor_share: share of the mission's mean correction by which each fit moves back; 0 if the poses do not come from
-    an odometry.
-    """
-
-    prior: PoseExposurePrior
-    keyframes_per_frame: int
-    anchor_share: float
+    prior: PoseExposurePrior  # standard deviations of pose and exposure errors
+    keyframes_per_frame: int  # keyframes refined with each frame
+    anchor_share: float  # of the mission's mean correction, by which each fit moves back; 0 without an odometry
 
 
 class ViewRefiner(Protocol):

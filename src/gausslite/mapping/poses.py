@@ -27,6 +27,7 @@ _MAX_POSES = 20_000
 """Beyond this number, every second pose of the older half is removed: 5 MB."""
 _RECENT_POSES = 32
 """Frames whose changes of correction give its uncertainty."""
+_POSES = ("T_world_odometry", "T_world_prior", "T_world_map")
 
 
 class _Pose(NamedTuple):
@@ -50,9 +51,6 @@ class _Pose(NamedTuple):
         """Return the pose moved with its anchor."""
         T = T_corrected_earlier[self.anchor]
         return self._replace(T_world_prior=T @ self.T_world_prior, T_world_map=T @ self.T_world_map)
-
-
-_POSES = ("T_world_odometry", "T_world_prior", "T_world_map")
 
 
 class PoseTable:

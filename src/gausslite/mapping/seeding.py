@@ -34,6 +34,15 @@ _RESERVED_VIEWS = 4.0
 """Background seeds leave free slots for this many more images."""
 _EDGE_EPSILON = 0.01
 """ε of GFD (Sec. III-C.3)."""
+_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
+_BLOCK_PX = 16
+_MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
+_MEDIAN_STRATIFIED = 0.89
+_MIN_SQUARED_M = 1e-7
+_REFERENCE_PIXELS = 640 * 480
+"""Image size of the seed counts in SeedingSettings."""
+_MIN_ROI_ROOM = 0.05
+"""Lowest density of ROI seeds relative to that of an empty map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +51,7 @@ class RenderedView:
 
     alpha: Float32[ndarray, "h w"]
     depth_m: Float32[ndarray, "h w"]
-    rgb: Float32[ndarray, "h w 3"]
+    rgb: Float32[ndarray, "h w 3"]  # as rendered, in [0, 1]
 
     @classmethod
     def from_rendering(cls, rendering: Rendering) -> RenderedView:
@@ -108,9 +117,6 @@ def _count_per_cell(rows: ndarray, columns: ndarray, shape: tuple[int, int]) -> 
     return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
 
 
-_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
-
-
 def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     """Return E(u, v) = ‖∇I(u, v)‖, the Sobel gradient magnitude of the luminance in [0, 1] (Sec. III-C.3)."""
     luminance = rgb @ _LUMINANCE
@@ -170,12 +176,6 @@ def _arrival_times(
     return arrival
 
 
-_BLOCK_PX = 16
-_MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
-_MEDIAN_STRATIFIED = 0.89
-_MIN_SQUARED_M = 1e-7
-
-
 def neighbour_distance_px(
     pixels: Int64[ndarray, " n"], pool: Bool[ndarray, "h w"], stratified: bool
 ) -> Float32[ndarray, " n"]:
@@ -212,36 +212,23 @@ def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
     return np.asarray(cv2.boxFilter(blocks, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
-_REFERENCE_PIXELS = 640 * 480
-"""Image size of the seed counts in SeedingSettings."""
-_MIN_ROI_ROOM = 0.05
-"""Lowest density of ROI seeds relative to that of an empty map."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SeedingContext:
-    """State of the map before seeding.
+    """State of the map before seeding."""
 
-    free_slots: Gaussians that still fit under the cap. rendered: the map rendered from the frame's pose, None if the
-    map is empty. active_means_m: means of the active Gaussians. max_active: how many may be active; None: any number.
-    """
-
-    free_slots: int
-    rendered: RenderedView | None
-    active_means_m: Float32[ndarray, "n 3"]
-    max_active: int | None = None
+    free_slots: int  # Gaussians that still fit under the cap
+    rendered: RenderedView | None  # the map rendered from the frame's pose, None if the map is empty
+    active_means_m: Float32[ndarray, "n 3"]  # means of the active Gaussians
+    max_active: int | None = None  # how many may be active; None: any number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel).
+    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel)."""
 
-    anchor: number of the keyframe that they follow when poses are corrected.
-    """
-
-    roi: Gaussians
+    roi: Gaussians  # N_ROI
     background: Gaussians
-    anchor: int = NO_ANCHOR
+    anchor: int = NO_ANCHOR  # number of the keyframe that they follow when poses are corrected
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,7 @@ refinement ends, and its last large steps would remain as noise. Over the 3DGS r
 region and 1.0 dB over the whole image of the simulated home. The decay gains 0.9 dB in the region (fitted views) on a
 real kitchen with the frames of two robots, and 0.2 dB on simulated homes.
 """
+BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,35 +65,24 @@ class ActivePhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SeedingSettings:
-    """Placement and initialisation of new Gaussians (Sec. III-C).
+    """Placement and initialisation of new Gaussians (Sec. III-C)."""
 
-    first_frame_seeds, later_seeds: N for an image of 640x480, scaled with the number of pixels. roi_share: ρ.
-    min_alpha, roi_min_alpha: background and ROI pixels of lower rendered alpha are seeded. depth_error_factor: pixels
-    rendered behind the measured depth by this multiple of the median depth error are seeded. roi_pixels_per_gaussian:
-    ROI pixels per active Gaussian, below which the ROI is dense enough. fill_sparse_roi: seed ROI pixels with fewer
-    active Gaussians too. min_density_ratio: lowest density of background seeds relative to a first frame's.
-    background_share: share of the cap that ROI seeds leave to the background; they become sparser as the region fills
-    the rest. opacity, roi_scale, background_scale: opacity and the multipliers m of s0 (Sec. III-C.2); init_scale: m
-    without SIS. fill_depth: blocks without a measured depth are seeded too, at `with_filled_depth`. Sensors have none
-    on dark, glossy or distant surfaces and at the border of registered images; without seeds, the colours there distort
-    the Gaussians around.
-    """
-
-    first_frame_seeds: int = 60_000
-    later_seeds: int = 10_000
-    roi_share: float = 0.40
-    min_alpha: float = 0.6
-    roi_min_alpha: float = 0.9
-    roi_pixels_per_gaussian: float = 4.0
-    fill_sparse_roi: bool = True
-    min_density_ratio: float = 0.1
-    background_share: float = 0.3
-    depth_error_factor: float = 40.0
-    max_depth_m: float = 10.0
-    opacity: float = 0.5
-    roi_scale: float = 0.5
-    background_scale: float = 0.7
-    init_scale: float = 1.0
+    first_frame_seeds: int = 60_000  # N for the first image of 640x480; scaled with the number of pixels
+    later_seeds: int = 10_000  # N for each later one
+    roi_share: float = 0.40  # ρ of SB (Sec. III-C.1): largest share of the seeds that goes to the ROI
+    min_alpha: float = 0.6  # background pixels of lower rendered alpha are seeded: the map does not explain them
+    roi_min_alpha: float = 0.9  # the same for ROI pixels; higher, because the region should have no holes
+    roi_pixels_per_gaussian: float = 4.0  # ROI pixels per active Gaussian, below which the ROI is dense enough
+    fill_sparse_roi: bool = True  # seed ROI pixels with fewer active Gaussians too
+    min_density_ratio: float = 0.1  # lowest density of background seeds relative to a first frame's
+    background_share: float = 0.3  # of the cap, which ROI seeds leave to the background; they become sparser near it
+    depth_error_factor: float = 40.0  # pixels rendered behind the measured depth by so many median errors are seeded
+    max_depth_m: float = 10.0  # no seeds beyond: a single outlier would enlarge the whole scene
+    opacity: float = 0.5  # α₀ of Sec. III-C.2
+    roi_scale: float = 0.5  # m of Eq. (1) for seeds of the ROI
+    background_scale: float = 0.7  # m of Eq. (1) for seeds of the background
+    init_scale: float = 1.0  # m without SIS
+    # also seed blocks without a measured depth (`with_filled_depth`): their colours distort the Gaussians around
     fill_depth: bool = True
 
     def __post_init__(self) -> None:
@@ -114,31 +104,21 @@ class SeedingSettings:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeSettings:
-    """Keyframes to train on (Sec. III-D.2) and to keep for joint refinement (Sec. III-E).
+    """Keyframes to train on (Sec. III-D.2) and to keep for joint refinement (Sec. III-E)."""
 
-    every: every `every`th mapped frame is a keyframe. window: most recent keyframes to train on. buffer: keyframes of
-    the whole mission to keep. long_term_keyframes: more frames to train on, spread over the mission: this number that
-    show the ROI and as many others; 0 is the paper's window. Each needs as much memory as a keyframe of the window.
-    roi_context_weight: weight in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is
-    the paper's binary mask. pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame
-    if `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
-    trained; 0 trains all depth, as the paper. rotates: views train in turn (`ViewRotation`); False draws them
-    uniformly, as the paper. half_size_from_px: an iteration on whole images of at least this many pixels trains four of
-    them in half size, with the pixels of one; inf trains one in full size, as the paper. max_pixels: cap on the pixels
-    of all keyframes together, reached with images larger than about 1280x720; a pixel needs 13 bytes, or 20 with
-    refined poses.
-    """
-
-    every: int = 5
-    window: int = 24
-    buffer: int = 96
-    long_term_keyframes: int = 24
+    every: int = 5  # every `every`th mapped frame is a keyframe
+    window: int = 24  # most recent keyframes to train on
+    buffer: int = 96  # keyframes of the whole mission to keep
+    long_term_keyframes: int = 24  # more frames that show the ROI, and as many others; 0 is the paper's window
+    # of other pixels in the ROI's tiles, to keep them in place; 0: the paper's mask
     roi_context_weight: float = 0.3
-    pose_updates_per_frame: int = 2
-    depth_edge_px: int = 2
-    rotates: bool = True
+    pose_updates_per_frame: int = 2  # keyframes refined again with each frame, if the pose prior allows an error
+    depth_edge_px: int = 2  # depth this near to a depth jump is not trained: sensors err there; 0 as the paper
+    rotates: bool = True  # views train in turn (`ViewRotation`); False draws them uniformly, as the paper
+    # from this size on, an iteration on whole images trains four of them in half size, with the pixels of one;
+    # inf trains one in full size, as the paper
     half_size_from_px: float = 150_000
-    max_pixels: int = 160_000_000
+    max_pixels: int = 160_000_000  # of all keyframes, reached with images above 1280x720; a pixel needs 13 to 20 bytes
 
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer", "half_size_from_px", "max_pixels"):
@@ -159,28 +139,20 @@ class KeyframeSettings:
         )
 
 
-BALANCED_LOSS = LossWeights(normalise_by_image=True)
-
-
 @dataclass(frozen=True, slots=True)
 class OptimizationSettings:
-    """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
+    """Training with one frame (Sec. III-D): warm-up iterations on full images, then active ones in the ROI."""
 
-    active_views: views that an active iteration trains in turn, if the tiles of their regions are together no more than
-    one image; 1 is the paper's. loss: weights of Eq. (2). By default they are normalised by the image size. Adam's
-    steps with the small masks of the active phase are then comparable to those with full images. adam: learning rates.
-    isotropic: make Gaussians spheres after every frame. ema_updates: time constant, in updates,
-    of the exponential moving average (EMA) of each Gaussian. The EMA is shown and saved, but not trained; 0 shows the
-    trained values.
-    """
-
-    warmup_iterations: int = 2
-    active_iterations: int = 6
+    warmup_iterations: int = 2  # on whole images; they keep the background in place
+    active_iterations: int = 6  # in the region's tiles
+    # trained in turn by an active iteration, if their tiles are no more than one image; 1 as the paper
     active_views: int = 8
-    active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
+    active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS  # which Gaussians these render and update
+    # Eq. (2), divided by the image's pixels: Adam's steps with small masks stay comparable
     loss: LossWeights = BALANCED_LOSS
-    adam: AdamSettings = ONLINE_RATES
-    isotropic: bool = False
+    adam: AdamSettings = ONLINE_RATES  # learning rates
+    isotropic: bool = False  # make Gaussians spheres after every frame
+    # time constant of the average of a Gaussian that is shown and saved; 0 shows the trained values
     ema_updates: float = 32.0
 
     def __post_init__(self) -> None:
@@ -209,16 +181,14 @@ class OptimizationSettings:
 
 @dataclass(frozen=True, slots=True)
 class SaturationSettings:
-    """Release of active iterations to whole images.
+    """Release of active iterations to whole images, by the mean decrease of the log loss per visit of a view.
 
-    max_released: largest share of the active iterations that is released; 0 disables the release. The rest keeps
-    measuring the region. improving, saturated: mean decreases of the log loss per visit of a view. No iteration is
-    released from `improving` upwards, and max_released from `saturated` downwards. Between them the share is linear.
+    Between `improving` and `saturated`, the share of the released iterations is linear.
     """
 
-    max_released: float = 0.75
-    improving: float = 0.12
-    saturated: float = 0.04
+    max_released: float = 0.75  # largest share that is released; the rest keeps measuring the region. 0 releases none
+    improving: float = 0.12  # from this decrease upwards, no iteration is released
+    saturated: float = 0.04  # from this one downwards, max_released
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_released <= 1:
@@ -231,20 +201,15 @@ class SaturationSettings:
 
 @dataclass(frozen=True, slots=True)
 class DensitySettings:
-    """Settings of density control.
+    """Settings of density control, as in 3DGS."""
 
-    densify_every, prune_every: in mapping iterations. min_mean_gradient: in half image widths, as in the rasterizer's
-    statistics. percent_dense: Gaussians up to this fraction of the scene's extent are cloned, larger ones split.
-    max_growth: bound of one densification, as a fraction of the number of Gaussians. At low resolution, where all
-    gradients are large, the threshold alone would fill the table and leave no free slots for seeds.
-    """
-
-    densify_every: int = 150
-    min_mean_gradient: float = 2e-4
-    percent_dense: float = 0.01
+    densify_every: int = 150  # mapping iterations
+    min_mean_gradient: float = 2e-4  # in half image widths, as in the rasterizer's statistics
+    percent_dense: float = 0.01  # Gaussians up to this fraction of the scene's extent are cloned, larger ones split
+    # of one densification: at low resolution, where all gradients are large, it would fill the table
     max_growth: float = 0.05
-    prune_every: int = 100
-    min_opacity: float = 0.005
+    prune_every: int = 100  # mapping iterations
+    min_opacity: float = 0.005  # Gaussians below are pruned
 
     def __post_init__(self) -> None:
         for name in ("densify_every", "prune_every"):
@@ -255,24 +220,21 @@ class DensitySettings:
 
 @dataclass(frozen=True, slots=True)
 class MapperSettings:
-    """A mapping policy.
+    """A mapping policy."""
 
-    max_gaussians: hard cap; memory for exactly this number is allocated at the start. pose_prior: prior of the pose and
-    exposure error of each view; keyframes are refined unless it is exact. pose_anchor_share: share of the mission's
-    mean pose correction by which each refined pose moves back towards the odometry; 0 for poses without odometry.
-    leaves_out_moving: pixels of things that move are neither seeded nor trained.
-    """
-
-    max_gaussians: int = 1_000_000
+    max_gaussians: int = 1_000_000  # hard cap; memory for exactly this number is allocated at the start
     components: Components = field(default_factory=Components)
     seeding: SeedingSettings = field(default_factory=SeedingSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
     saturation: SaturationSettings = field(default_factory=SaturationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
-    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
+    pose_prior: PoseExposurePrior = field(
+        default_factory=PoseExposurePrior
+    )  # of the error of each view; refined unless exact
+    # of the mission's mean correction, by which each refined pose moves back; 0 without odometry
     pose_anchor_share: float = 0.1
-    leaves_out_moving: bool = True
+    leaves_out_moving: bool = True  # pixels of things that move are neither seeded nor trained
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)

@@ -22,14 +22,11 @@ _MAX_EVIDENCE = 100
 
 @dataclass(frozen=True, slots=True)
 class Reevaluation:
-    """Earlier keyframes that were evaluated while one frame was mapped, and Gaussians seeded from them.
+    """Earlier keyframes that were evaluated while one frame was mapped, and Gaussians seeded from them."""
 
-    keyframes: evaluated for a new task, with a detection. completed: objects that became known since were added.
-    """
-
-    keyframes: int = 0
+    keyframes: int = 0  # evaluated for a new task, with a detection
     seeded: int = 0
-    completed: int = 0
+    completed: int = 0  # objects that became known since were added
 
 
 def clear_roi(table: SplatTable) -> None:

@@ -35,6 +35,12 @@ _MAX_CHANGE = 0.3
 """Bound of one visit's change of the log loss: a refined pose may change the loss of a view at once."""
 _MAX_VIEWS = 256
 """Views whose last loss is kept, those visited last."""
+_COLOUR_RANGE = (-0.25, 1.25)
+"""Wider than [0, 1], so that blended colours still reach black and white."""
+_RANDOM_BLOCK = 16
+_HALF_SIZE_VIEWS = 4
+_Rows: TypeAlias = Float32[ndarray, "n 16"]
+_Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
 
 
 class RegionSaturation:
@@ -192,14 +198,6 @@ class CountedScheduler:
         """Return True until the number of iterations is reached."""
         del stage
         return self._iterations < iterations_per_frame
-
-
-_COLOUR_RANGE = (-0.25, 1.25)
-"""Wider than [0, 1], so that blended colours still reach black and white."""
-_RANDOM_BLOCK = 16
-_HALF_SIZE_VIEWS = 4
-_Rows: TypeAlias = Float32[ndarray, "n 16"]
-_Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -80,12 +80,12 @@ class ResumeConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedRun:
-    """A run read from a file. extra: the arrays that the caller of `save_run` added."""
+    """A run read from a file."""
 
     path: Path
     config: ResumeConfig
     last_index: int
-    extra: State
+    extra: State  # the arrays that the caller of `save_run` added
     _task_mapper: State = field(repr=False)
 
     @classmethod

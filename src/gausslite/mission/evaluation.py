@@ -18,7 +18,7 @@ from gausslite.render.map_viewer import MapViewer
 class TrainingFit:
     """Mean PSNR in dB over views that a map was trained on; that of the region is None if no view shows it."""
 
-    roi_psnr: float | None
+    roi_psnr: float | None  # dB
     full_psnr: float
     n_views: int
 
@@ -27,7 +27,7 @@ class TrainingFit:
 class TrajectoryError:
     """ATE over the poses at common times (Sturm et al. 2012), aligned in SE(3), without scale."""
 
-    rmse_m: float
+    rmse_m: float  # root of the mean squared distance
     max_m: float
     poses: int
 

@@ -46,7 +46,7 @@ class SchedulerSettings:
     following frames. A frame with fewer iterations counts as under-trained.
     """
 
-    seconds_per_frame: float = 0.25
+    seconds_per_frame: float = 0.25  # 1 / rate
     min_iterations: int = 15
     skip_stages: tuple[SkippableStage, ...] = (SkippableStage.PUBLISHING, SkippableStage.SEEDING)
     deadline_slack: float = 0.15
@@ -71,17 +71,13 @@ class SchedulerSettings:
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """Time of one frame in total and by stage, and its skipped stages.
+    """Time of one frame in total and by stage, and its skipped stages."""
 
-    under_trained: it trained fewer than min_iterations. late: it ended after its deadline and the slack, so that the
-    rate falls.
-    """
-
-    seconds: float
+    seconds: float  # from its arrival at the mapper
     stages_s: Mapping[Stage, float]
     skipped_stages: frozenset[SkippableStage]
-    under_trained: bool
-    late: bool = False
+    under_trained: bool  # it trained fewer than min_iterations
+    late: bool = False  # it ended after its deadline and the slack, so that the rate falls
 
 
 class FrameScheduler:

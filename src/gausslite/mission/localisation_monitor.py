@@ -27,10 +27,10 @@ class LocalisationState(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Admission:
-    """The frames to map now, oldest first; without any, the reason. T_map_odometry: of a robot that was found again."""
+    """The frames to map now, oldest first; without any, the reason."""
 
     frames: Sequence[Frame] = ()
-    T_map_odometry: Float64[ndarray, "4 4"] | None = None
+    T_map_odometry: Float64[ndarray, "4 4"] | None = None  # of a robot that was found again
     reason: str = UNPLACED
 
 

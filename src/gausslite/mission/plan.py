@@ -61,22 +61,20 @@ class _Sequence:
 class RunPlan:
     """What a run maps, and how. Without tasks and regions, the map is uniform.
 
-    mission, source: what is still to be estimated counts as exact and as recorded. task: selects regions of the
-    sequence; regions: given ones. stated: what the user states of the recording. can_point: a person can point at what
-    nothing detects. prior: the folder of the run whose map is continued; resume: a saved run. notes: for the user.
+    In mission and source, what is still to be estimated counts as exact and as recorded.
     """
 
     mission: MissionSettings
     perception: PerceptionSettings
     source: SourceSettings = field(default_factory=lambda: SourceSettings(""))
     schedule: TaskSchedule = field(default_factory=lambda: TaskSchedule(None))
-    task: TaskSettings = field(default_factory=TaskSettings)
-    regions: tuple[Region, ...] = ()
-    stated: StatedValues = field(default_factory=StatedValues)
-    can_point: bool = False
-    prior: Path | None = None
-    resume: Path | None = None
-    notes: tuple[str, ...] = ()
+    task: TaskSettings = field(default_factory=TaskSettings)  # selects regions of the sequence
+    regions: tuple[Region, ...] = ()  # given regions, in place of a task's
+    stated: StatedValues = field(default_factory=StatedValues)  # what the user states of the recording
+    can_point: bool = False  # a person can point at what nothing detects
+    prior: Path | None = None  # the folder of the run whose map is continued
+    resume: Path | None = None  # a saved run
+    notes: tuple[str, ...] = ()  # for the user
 
     def check(self, out: Path | None) -> None:
         """Raise for what would fail later, before anything is opened. out: the folder of the results.
@@ -226,18 +224,14 @@ class RunPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenRun:
-    """A run before its first frame: its frames, and the mapper that owns the map.
+    """A run before its first frame: its frames, and the mapper that owns the map."""
 
-    plan: with the values that were found. sequence: world frame of the recording; that of the stream is the map's.
-    prior: the earlier map that is continued. notes: on poses or depth that contradict the images.
-    """
-
-    plan: RunPlan
+    plan: RunPlan  # with the values that were found
     stream: FrameStream
     scheduled: ScheduledTaskMapper
-    sequence: str
-    prior: PriorMap | None = None
-    notes: tuple[str, ...] = ()
+    sequence: str  # world frame of the recording; that of the stream is the map's
+    prior: PriorMap | None = None  # the earlier map that is continued
+    notes: tuple[str, ...] = ()  # on poses or depth that contradict the images
 
     def map(
         self,
@@ -301,13 +295,13 @@ class OpenRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedRun:
-    """A run after its last frame. save_error: why it could not be saved."""
+    """A run after its last frame."""
 
     run: OpenRun
     result: MissionResult
-    corrupt: CorruptFrames
+    corrupt: CorruptFrames  # frames that could not be read
     gaussians: Gaussians
-    save_error: StorageError | None = None
+    save_error: StorageError | None = None  # why it could not be saved
 
     @property
     def mapper(self) -> TaskMapper:

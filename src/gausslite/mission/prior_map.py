@@ -28,13 +28,12 @@ PRIOR_FOLDER: Final = "prior_folder"
 class MapChanges:
     """What changed since the earlier map.
 
-    objects: of the run, and earlier ones that it has neither found again nor seen to be gone. lines: the changes, for a
-    person. report: parts of report.json.
+    objects: of the run, and earlier ones that it has neither found again nor seen to be gone.
     """
 
     objects: Sequence[ObjectLandmark]
-    lines: tuple[str, ...] = ()
-    report: Mapping[str, object] = field(default_factory=dict)
+    lines: tuple[str, ...] = ()  # the changes, for a person
+    report: Mapping[str, object] = field(default_factory=dict)  # parts of report.json
 
 
 @runtime_checkable

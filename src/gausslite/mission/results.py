@@ -30,6 +30,14 @@ from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 
+MAP, _REPORT = "map.ply", "report.json"
+_FIRST_BYTES = 512
+PREVIEW = "preview.png"
+REPORT_PAGE = "report.html"
+"""Name of the page that `gausslite report` and `gausslite demo` write."""
+EVALUATION = "evaluation.json"
+MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
+
 
 def write_keyframes(folder: Path, keyframes: Sequence[Keyframe]) -> None:
     """Write keyframes.json. keyframes: oldest first. Raises StorageError."""
@@ -41,25 +49,13 @@ def _view(keyframe: Keyframe) -> KeyframeView:
     return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)
 
 
-MAP, _REPORT = "map.ply", "report.json"
-_FIRST_BYTES = 512
-PREVIEW = "preview.png"
-REPORT_PAGE = "report.html"
-"""Name of the page that `gausslite report` and `gausslite demo` write."""
-EVALUATION = "evaluation.json"
-MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
-
-
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """A kind of file that a command writes; mark: bytes that stand among the first ones of each such file.
-
-    suffix: by which other tools know the kind; empty if a file may have any name.
-    """
+    """A kind of file that a command writes."""
 
     name: str
-    mark: bytes
-    suffix: str = ""
+    mark: bytes  # bytes that stand among the first ones of each such file
+    suffix: str = ""  # by which other tools know the kind; empty if a file may have any name
 
     def require_replaceable(self, path: Path) -> None:
         """Raise StorageError for another suffix, or if the path holds a file of another kind, which would be lost."""

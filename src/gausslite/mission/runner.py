@@ -20,6 +20,7 @@ from gausslite.process import DeferredInterrupt
 
 OnCorrupt = Callable[[int, DatasetError | PoseError], None]
 """Gets the index and the error of each frame that cannot be read."""
+_NO_FRAME_INDEX = -1
 
 
 def region_file_note(spec: str, source: Source) -> str | None:
@@ -93,25 +94,19 @@ class CorruptFrames:
         self._report(f"frame {index} skipped: {error}")
 
 
-_NO_FRAME_INDEX = -1
-
-
 @dataclass(slots=True)
 class MissionTotals:
-    """Sums over the frames of a mission.
+    """Sums over the frames of a mission."""
 
-    frames: mapped ones; late: those of them that missed their deadline. reasons: of the skipped frames.
-    """
-
-    frames: int = 0
-    reasons: Counter[str] = field(default_factory=Counter)
-    late: int = 0
+    frames: int = 0  # mapped ones
+    reasons: Counter[str] = field(default_factory=Counter)  # of the skipped frames
+    late: int = 0  # those of them that missed their deadline
     iterations: int = 0
     keyframes_reevaluated: int = 0
     seeded_in_keyframes: int = 0
     roi_share_sum: float = 0.0
-    busy_s: float = 0.0
-    region_seen: bool = False
+    busy_s: float = 0.0  # time of processing
+    region_seen: bool = False  # a frame has shown the task's region
 
     @property
     def skipped(self) -> int:
@@ -143,16 +138,12 @@ class MissionTotals:
 
 @dataclass(frozen=True, slots=True)
 class MissionResult:
-    """Result of a mission.
+    """Result of a mission."""
 
-    totals: sums over its frames; seconds: wall time; last_index: index of the last processed frame, or the index that
-    the run was resumed after; stopped_by: the error or interrupt that ended it early.
-    """
-
-    totals: MissionTotals
-    seconds: float
-    last_index: int
-    stopped_by: GaussLiteError | KeyboardInterrupt | None
+    totals: MissionTotals  # sums over its frames
+    seconds: float  # wall time
+    last_index: int  # index of the last processed frame, or the index that the run was resumed after
+    stopped_by: GaussLiteError | KeyboardInterrupt | None  # the error or interrupt that ended it early
 
     @property
     def processed(self) -> int:
@@ -190,13 +181,12 @@ class MissionResult:
 class MissionRunner:
     """Pass frames to a processing step, one after the other.
 
-    process: maps one frame, or queues it elsewhere and returns None. on_frame: gets each outcome, for progress.
     should_stop: called before each frame; the run ends if it returns True. Publishing is part of the processing step,
     see `TaskMapper`.
     """
 
-    process: Callable[[Frame], FrameOutcome | None]
-    on_frame: Callable[[FrameOutcome], None] = lambda _outcome: None
+    process: Callable[[Frame], FrameOutcome | None]  # maps one frame, or queues it elsewhere and returns None
+    on_frame: Callable[[FrameOutcome], None] = lambda _outcome: None  # gets each outcome, for progress
     should_stop: Callable[[], bool] = field(default=lambda: False)
 
     def run(self, frames: Iterable[Frame], resumed_after: int = _NO_FRAME_INDEX) -> MissionResult:

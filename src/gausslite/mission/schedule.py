@@ -20,7 +20,7 @@ class TaskSchedule:
     """The first task of a mission (None without a task in natural language), and later ones by their first frame."""
 
     first: TaskGraph | None
-    switches: tuple[tuple[int, TaskGraph], ...] = ()
+    switches: tuple[tuple[int, TaskGraph], ...] = ()  # (frame number, task), ascending
 
     @classmethod
     def parse(cls, first: TaskGraph | None, switches: Sequence[str], parser: TaskParser) -> TaskSchedule:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -31,7 +31,6 @@ from gausslite.domain.relevance import Region, TargetPoint
 from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.frame_scheduler import SchedulerSettings
-from gausslite.nouns import meant_by
 from gausslite.perception.detector_file import MAX_TILES_PER_SIDE
 from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.choose import backends
@@ -111,20 +110,10 @@ class SceneInfo:
         """Return the upward direction and the ground-truth regions of a sequence."""
         return cls(source.up_axis, source.regions())
 
-    def regions_of(self, targets: Collection[str]) -> dict[str, Region]:
-        """Return the regions of the objects that these nouns of a task mean."""
-        meant = {name for target in targets for name in meant_by(target, self.regions)}
-        return {name: roi for name, roi in self.regions.items() if name in meant}
-
 
 @dataclass(frozen=True, slots=True)
 class SourceSettings:
-    """A sequence and which of its frames a mission uses.
-
-    depth_registration: the colour camera to register depth to, None if depth is registered already.
-    camera_correction: lens, rolling shutter and time offset, None for the lens of the files. require_poses: False also
-    uses frames without a pose, for tracking.
-    """
+    """A sequence and which of its frames a mission uses."""
 
     spec: str = option(
         MISSING,
@@ -157,7 +146,7 @@ class SourceSettings:
         plain_type=str,
         convert=read_registration,
         to_plain=str,
-    )
+    )  # the colour camera to register depth to, None if depth is registered already
     camera_correction: CameraCorrection | None = option(
         None,
         CORRECTION_HELP,
@@ -165,8 +154,8 @@ class SourceSettings:
         plain_type=str,
         convert=read_correction,
         to_plain=write_correction,
-    )
-    require_poses: bool = True
+    )  # lens, rolling shutter and time offset, None for the lens of the files
+    require_poses: bool = True  # False also uses frames without a pose, for tracking
 
 
 @dataclass(frozen=True, slots=True)

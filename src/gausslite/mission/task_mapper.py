@@ -49,23 +49,21 @@ _MAX_REEVALUATED = 3
 class FrameOutcome:
     """Result of one frame.
 
-    skipped: why the frame was not mapped, else None. changed_roi: the changed voxels of the task's region; None
-    without a tracker, for a skipped frame, and if publishing waits for the next frame. detection_lag_frames: age of
-    the detection that finished during this frame. reevaluation: the earlier keyframes evaluated for a new task.
-    recovered: outcomes of frames that waited for the robot's place and are mapped now, before this one.
+    changed_roi: the changed voxels of the task's region; None without a tracker, for a skipped frame, and if publishing
+    waits for the next frame.
     """
 
-    index: int
-    iterations: int
-    gaussians: int
-    roi_share: float
+    index: int  # number in the sequence
+    iterations: int  # of training
+    gaussians: int  # in the map afterwards
+    roi_share: float  # of the pixels
     timing: FrameTiming
-    skipped: str | None = None
+    skipped: str | None = None  # why the frame was not mapped, else None
     changed_roi: VoxelBatch | None = None
-    detection_lag_frames: int | None = None
-    reevaluation: Reevaluation = field(default_factory=Reevaluation)
-    localisation: LocalisationState = LocalisationState.TRACKED
-    recovered: tuple[FrameOutcome, ...] = ()
+    detection_lag_frames: int | None = None  # age of the detection that finished during this frame
+    reevaluation: Reevaluation = field(default_factory=Reevaluation)  # the earlier keyframes evaluated for a new task
+    localisation: LocalisationState = LocalisationState.TRACKED  # whether the robot's place was known
+    recovered: tuple[FrameOutcome, ...] = ()  # of frames that waited for the robot's place, mapped before this one
 
     @property
     def mapped(self) -> tuple[FrameOutcome, ...]:
@@ -164,7 +162,7 @@ class TaskMapper:
             f"frames are skipped in which {defect}; the first one is {index}" for defect, index in self._defects.items()
         )
         places = () if self._monitor is None else self._monitor.notes
-        return (*self._estimator.notes, *defects, *places, *filter(None, [self._mapper.loops.describe()]))
+        return (*self._estimator.notes, *defects, *places, *filter(None, [self.loops.describe()]))
 
     @property
     def localisation(self) -> LocalisationState:
@@ -203,7 +201,7 @@ class TaskMapper:
 
     def camera_view(self) -> CameraView | None:
         """Return the newest keyframe, the camera's path and the newest detection; None before the first keyframe."""
-        keyframes = self._mapper.keyframes()
+        keyframes = self.keyframes()
         if not keyframes:
             return None
         newest, trajectory = keyframes[-1], self._mapper.poses.trajectory()
@@ -228,11 +226,11 @@ class TaskMapper:
 
     def keyframes(self) -> list[Keyframe]:
         """Return the keyframes kept from the whole mission, oldest first."""
-        return self._mapper.keyframes()
+        return list(self._mapper.store.kept)
 
     def pointed_masks(self, pointed: Sequence[PointedObject]) -> list[PointedMask]:
         """Return the mask of each object pointed at on a known keyframe. Raises InvalidInputError."""
-        frames = [*self._shown, *(keyframe.as_recorded for keyframe in self._mapper.keyframes())]
+        frames = [*self._shown, *(keyframe.as_recorded for keyframe in self._mapper.store.kept)]
         return pointed_masks(pointed, sorted(frames, key=lambda frame: frame.capture_time_ns))
 
     def memory_mib(self) -> dict[str, float]:
@@ -336,7 +334,8 @@ class TaskMapper:
     @property
     def loops(self) -> LoopCounts:
         """What became of the loops so far."""
-        return self._mapper.loops
+        corrector = self._mapper.corrector
+        return LoopCounts() if corrector is None else corrector.counts
 
     @property
     def tracking_counts(self) -> Mapping[str, int]:
@@ -358,7 +357,7 @@ class TaskMapper:
 
     def _skip(self, frame: Frame, reason: str) -> FrameOutcome:
         """Return the outcome of a frame that is not mapped."""
-        count, timing, localisation = self._mapper.count, self._scheduler.end(), self.localisation
+        count, timing, localisation = self._mapper.table.count, self._scheduler.end(), self.localisation
         return FrameOutcome(frame.index, 0, count, 0.0, timing, reason, localisation=localisation)
 
     def _estimate_relevance(self, view: FrameView) -> RelevanceEstimate:
@@ -369,8 +368,9 @@ class TaskMapper:
         """Update an earlier keyframe with its delayed relevance, and return the delay in frames."""
         if delayed is None:
             return None
-        with self._scheduler.timing(Stage.VIEW_PREPARATION):
-            self._mapper.update_relevance(delayed.frame, delayed.relevance)
+        if (keyframe := self._mapper.store.get(delayed.frame)) is not None:
+            with self._scheduler.timing(Stage.VIEW_PREPARATION):
+                self._mapper.evaluate_keyframe(keyframe, delayed.relevance)
         return delayed.lag_frames
 
     def _reevaluate_keyframes(self) -> Reevaluation:

@@ -111,10 +111,10 @@ def _is_rather(other: Landmark, landmark: Landmark) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibilityCheck:
-    """Decides whether a frame should show a landmark. depth_m: the depth of the nearest surface in each pixel."""
+    """Decides whether a frame should show a landmark."""
 
     frame: Frame
-    depth_m: Float32[ndarray, "h w"]
+    depth_m: Float32[ndarray, "h w"]  # the depth of the nearest surface in each pixel
 
     def is_visible(self, landmark: Landmark) -> bool:
         """Return True if most of the landmark's cells are in view, unoccluded and near enough to be detected.

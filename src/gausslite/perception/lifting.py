@@ -263,7 +263,7 @@ class FittedPlane:
 
     normal: Float64[ndarray, "3"]
     extent_m: float
-    thickness_m: float
+    thickness_m: float  # of the points beside it
 
     @classmethod
     def of(cls, points_m: Float64[ndarray, "n 3"]) -> FittedPlane:

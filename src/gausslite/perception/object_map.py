@@ -56,21 +56,20 @@ class Observation:
 
     The radius is twice the median distance of the points to the centroid: masks of chairs include background, which
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
-    capture time. rival: a different thing detected in the same place. votes: which voxels the mask
-    shows inside and outside the object. is_weak: of a weak detection. measured: attributes that the mask shows.
+    capture time. votes: which voxels the mask shows inside and outside the object.
     """
 
-    phrase: str
+    phrase: str  # the noun of the task
     centroid_m: Float64[ndarray, "3"]
     radius_m: float
     cells: Int64[ndarray, " k"]
     camera_m: Float64[ndarray, "3"] | None = None
     score: float = 1.0
     time_ns: int = 0
-    rival: Rival | None = None
+    rival: Rival | None = None  # a different thing detected in the same place
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
-    is_weak: bool = False
-    measured: Measured | None = None
+    is_weak: bool = False  # of a weak detection
+    measured: Measured | None = None  # attributes that the mask shows
 
     @classmethod
     def from_points(
@@ -111,38 +110,31 @@ def _is_inlier(
 class Landmark:
     """One object over all its observations. Its centroid is the mean of its cells, not weighted by their counts.
 
-    cells: keys of surface cells, with the number of observations of each in counts. missed_count: frames that should
-    have shown the object but did not. farthest_m: the largest distance of an observation. first_seen_ns, last_seen_ns:
-    capture times of its observations. number: assigned by the object map, in the order of first observations.
-    view_count: independent observations, the last one at view_ns from view_camera_m. score_sum: sum of its
-    scores; rival_scores: sums of the scores of different things in its place. votes: of its
-    masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
-    weak_count: frames with a weak detection only, whose score is in score_sum.
-    is_given: a person has pointed at it, so it exists whatever detections say. measured: its attributes so far.
+    first_seen_ns, last_seen_ns: capture times of its observations.
     """
 
-    phrase: str
+    phrase: str  # the noun of the task
     centroid_m: Float64[ndarray, "3"]
     radius_m: float
-    cells: Int64[ndarray, " k"]
+    cells: Int64[ndarray, " k"]  # keys of surface cells, with the number of observations of each in counts
     counts: Int64[ndarray, " k"]
-    seen_count: int
-    missed_count: int
-    best_score: float
-    farthest_m: float
+    seen_count: int  # frames that detected it
+    missed_count: int  # frames that should have shown the object but did not
+    best_score: float  # of all detections
+    farthest_m: float  # the largest distance of an observation
     first_seen_ns: int = 0
     last_seen_ns: int = 0
-    number: int = 0
-    view_count: int = 1
+    number: int = 0  # assigned by the object map, in the order of first observations
+    view_count: int = 1  # independent observations, the last one at view_ns from view_camera_m
     view_camera_m: Float64[ndarray, "3"] | None = None
     view_ns: int = 0
-    score_sum: float = 0.0
-    rival_scores: dict[str, float] = field(default_factory=dict)
-    votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
-    missed_in_a_row: int = 0
-    weak_count: int = 0
-    is_given: bool = False
-    measured: Measured | None = None
+    score_sum: float = 0.0  # sum of its scores
+    rival_scores: dict[str, float] = field(default_factory=dict)  # sums of the scores of different things in its place
+    votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)  # of its masks, on its surface
+    missed_in_a_row: int = 0  # frames since the last detection that should have shown it
+    weak_count: int = 0  # frames with a weak detection only, whose score is in score_sum
+    is_given: bool = False  # a person has pointed at it, so it exists whatever detections say
+    measured: Measured | None = None  # its attributes so far
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:

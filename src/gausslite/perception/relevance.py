@@ -35,14 +35,11 @@ class DelayedRelevance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelevanceEstimate:
-    """The relevance of a frame, and that of an earlier frame if its detection has finished since the last call.
-
-    detected: what that detection found, or one on this frame; None if none has finished.
-    """
+    """The relevance of a frame, and that of an earlier frame if its detection has finished since the last call."""
 
     relevance: RelevanceMap
     delayed: DelayedRelevance | None = None
-    detected: DetectedImage | None = None
+    detected: DetectedImage | None = None  # what that detection found, or one on this frame; None if none has finished
 
 
 class RelevanceEstimator(ABC):

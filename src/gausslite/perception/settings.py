@@ -55,11 +55,6 @@ class EvidenceSettings:
         require_plausible("evidence", self)
 
     @classmethod
-    def accept_all(cls) -> EvidenceSettings:
-        """Return settings that confirm every detection."""
-        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0, max_rival_ratio=np.inf, min_score_share=0.0)
-
-    @classmethod
     def accept_similar(cls) -> EvidenceSettings:
         """Return settings that also confirm objects that are rather a different thing."""
         return cls(max_rival_ratio=np.inf, min_score_share=0.0)
@@ -69,11 +64,10 @@ class EvidenceSettings:
 class RelevanceTrackerSettings:
     """All sections, and when to detect: the limits of the camera's motion (a comment in Sec. III-B.2) and of frames.
 
-    up_axis: up in the world frame, by default that of a level first camera. max_translation_m, max_rotation_deg,
-    max_frames: between two detections.
+    max_translation_m, max_rotation_deg, max_frames: between two detections.
     """
 
-    up_axis: UpAxis = (0.0, -1.0, 0.0)
+    up_axis: UpAxis = (0.0, -1.0, 0.0)  # up in the world frame, by default that of a level first camera
     max_translation_m: float = 1.0
     max_rotation_deg: float = 15.0
     max_frames: int = 5

@@ -44,6 +44,9 @@ _EDGE_RADIUS_PX = 2
 """Pixels by which an outline moves to a colour edge: bottles' precision 0.75 to 0.77, a mug's 0.84 to 0.88."""
 _EDGE_EPSILON = 1e-4
 """Variance of colour, in squared shares of the Lab range, below which an edge is noise."""
+# median distance to the middle of a disc, times this number, is its diameter
+_DISC_DIAMETERS: Final = 2.8
+Window = tuple[slice, slice]
 
 
 def is_in_large_part(points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, " n"]) -> Bool[ndarray, " n"]:
@@ -88,8 +91,6 @@ def _keys(voxels: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
 
 
 NEIGHBOUR_OFFSETS: Final = _neighbour_offsets()
-# median distance to the middle of a disc, times this number, is its diameter
-_DISC_DIAMETERS: Final = 2.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +157,6 @@ class SurfaceVotes:
             return 0.0
         distances_m = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
         return _DISC_DIAMETERS * float(np.median(distances_m))
-
-    def lowest_m(self, up: Float64[ndarray, "3"], percentile: float) -> float:
-        """Return the level of the surface's bottom, along up in the world; NaN without a surface."""
-        levels_m = self.surface_m.astype(np.float64) @ up
-        return float(np.percentile(levels_m, percentile)) if len(levels_m) else np.nan
 
     def resolved(self, min_voxel_m: float) -> SurfaceVotes:
         """Return the votes in voxels of a twelfth of the extent, and of at least min_voxel_m."""
@@ -301,9 +297,6 @@ def _guided_filter(
     slope_mean = cv2.blur(slope, window)
     filtered: Float32[ndarray, "h w"] = (slope_mean * guide).sum(axis=-1) + cv2.blur(offset, window)
     return filtered
-
-
-Window = tuple[slice, slice]
 
 
 def mask_votes(

@@ -47,6 +47,9 @@ SIMD_VARIABLE = "GAUSSLITE_SIMD"
 MAX_THREADS = 256
 _CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """CPU limit of a control group (version 2): microseconds per period, or `max`."""
+_Table: TypeAlias = Float32[ndarray, "n 16"]
+_Tables: TypeAlias = tuple[_Table, _Table, _Table]
+_Native = TypeVar("_Native")
 
 
 def usable_simd() -> tuple[str, ...]:
@@ -95,11 +98,6 @@ def choose_threads(requested: int | None) -> int:
     if not 1 <= requested <= MAX_THREADS:
         raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {requested}")
     return requested
-
-
-_Table: TypeAlias = Float32[ndarray, "n 16"]
-_Tables: TypeAlias = tuple[_Table, _Table, _Table]
-_Native = TypeVar("_Native")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -66,6 +66,8 @@ TANGENT_MARGIN = 1.3
 """Limit of the tangents in the Jacobian, as a factor of half the field of view."""
 MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
 """Limits of a moving camera's exposure time, in readouts, and of 1 - s readout / height."""
+_MIN_SCALE_M = 1e-7
+_MIN_OPACITY = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,11 +75,10 @@ class Subset:
     """The tiles and rows of a partial rendering; None selects all.
 
     tiles: True for each 16x16 tile to render, row-major from the top left; all other pixels are 0, with alpha 0.
-    ids: row numbers to render, ascending (active-only rendering).
     """
 
     tiles: Bool[ndarray, "th tw"] | None = None
-    ids: UInt32[ndarray, " m"] | None = None
+    ids: UInt32[ndarray, " m"] | None = None  # row numbers to render, ascending (active-only rendering)
 
 
 FULL_FRAME = Subset()
@@ -107,15 +108,14 @@ class Rendering:
 class SplatGradients:
     """Gradients of a scalar function of the rendered images.
 
-    d_rows: of the parameters; columns 14 and 15 are zero. d_twist: of the camera pose, for
-    T_camera_world ← exp(twist) T_camera_world with twist = (translation 3, rotation 3) in the camera frame.
-    visible: the visible rows, ascending. mean_2d_grad_norm: for each visible row, the norm of the gradient of its
-    2D mean, in units of half the image width and height.
+    d_twist: of the camera pose, for T_camera_world ← exp(twist) T_camera_world with twist = (translation 3, rotation 3)
+    in the camera frame. mean_2d_grad_norm: for each visible row, the norm of the gradient of its 2D mean, in units of
+    half the image width and height.
     """
 
-    d_rows: Float32[ndarray, "n 16"]
+    d_rows: Float32[ndarray, "n 16"]  # of the parameters; columns 14 and 15 are zero
     d_twist: Float64[ndarray, "6"]
-    visible: UInt32[ndarray, " m"]
+    visible: UInt32[ndarray, " m"]  # the visible rows, ascending
     mean_2d_grad_norm: Float32[ndarray, " m"]
 
 
@@ -134,9 +134,9 @@ class LossWeights:
     with any mask. Without it, masked steps have larger gradients, and Adam's steps on whole images hardly count.
     """
 
-    colour: float = 0.8
-    depth: float = 1.0
-    ssim: float = 0.2
+    colour: float = 0.8  # of |Î − I|; the paper states none
+    depth: float = 1.0  # λ_d of the paper
+    ssim: float = 0.2  # λ_s of the paper
     normalise_by_image: bool = False
 
     def __post_init__(self) -> None:
@@ -154,14 +154,14 @@ class AdamSettings:
     min(1, √(decay_after_updates / t)); t stops at MAX_UPDATE_COUNT. The default inf means no decay.
     """
 
-    means: float = 1e-4
+    means: float = 1e-4  # per step, in metres
     log_scales: float = 5e-3
     quats: float = 1e-3
     opacity_logits: float = 5e-2
     rgb: float = 2.5e-3
-    beta1: float = 0.9
-    beta2: float = 0.999
-    epsilon: float = 1e-15
+    beta1: float = 0.9  # decay of the first moment
+    beta2: float = 0.999  # decay of the second moment
+    epsilon: float = 1e-15  # keeps the step finite
     decay_after_updates: float = math.inf
 
     def __post_init__(self) -> None:
@@ -187,13 +187,10 @@ class AdamSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UpdateCounter:
-    """Counters of row updates: a step adds 1 to `counts` for each row that it changes and that `mask` selects.
-
-    mask: None selects all rows.
-    """
+    """Counters of row updates: a step adds 1 to `counts` for each row that it changes and that `mask` selects."""
 
     counts: UInt32[ndarray, " n"]
-    mask: Bool[ndarray, " n"] | None = None
+    mask: Bool[ndarray, " n"] | None = None  # None selects all rows
 
 
 @runtime_checkable
@@ -386,10 +383,6 @@ def require_view(
 def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:
     if len(ids) and (ids[-1] >= n or (ids[1:] <= ids[:-1]).any()):
         raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
-
-
-_MIN_SCALE_M = 1e-7
-_MIN_OPACITY = 1e-6
 
 
 def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:

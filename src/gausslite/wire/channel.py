@@ -24,6 +24,33 @@ AGENT_ADDRESS = "127.0.0.1:50053"
 UNIX = "unix:"
 MAX_PORT = 65535
 _WEB_SCHEMES = ("http://", "https://")
+_PROXY_VARIABLES = ("grpc_proxy", "https_proxy", "http_proxy")
+"""The variables from which gRPC takes a proxy, in its order."""
+MAX_MESSAGE_BYTES = 16 << 20
+"""Both ends refuse larger messages; a frame of two megapixels with PNG depth needs a fraction of it."""
+KEEPALIVE_S = 15.0
+"""Either end sends a ping after this time without data, and closes the connection if no answer comes within it."""
+DEADLINE_S = 30.0
+_REQUESTS_END_S = 1.0
+_RETRIED_METHODS = {
+    "gausslite.v1.ParserService": ("ParseTask",),
+    "gausslite.v1.AgentService": ("AssignTask", "EndMission", "GetAgentStatus", "RenderView"),
+    "gausslite.v1.FusionService": ("JoinSession", "GetSessionStatus", "QueryObjects", "ReportObjects", "LeaveSession"),
+}
+_RETRY_POLICY = {
+    "maxAttempts": 4,
+    "initialBackoff": "0.2s",
+    "maxBackoff": "2s",
+    "backoffMultiplier": 2,
+    "retryableStatusCodes": ["UNAVAILABLE"],
+}
+_METHODS = [{"service": service, "method": name} for service, names in _RETRIED_METHODS.items() for name in names]
+_SERVICE_CONFIG = json.dumps({"methodConfig": [{"name": _METHODS, "retryPolicy": _RETRY_POLICY}]})
+_Response = TypeVar("_Response")
+_DEADLINE_S = 3.0
+_SERVING = health_pb2.HealthCheckResponse.SERVING
+_MAX_BACKOFF_S = 5.0
+_MAX_RETRY_HINT_S = 60.0
 
 
 def host_and_port(name: str, address: str) -> tuple[str, int]:
@@ -45,10 +72,6 @@ def require_callable(name: str, address: str) -> str:
     if not is_socket and host_and_port(name, address)[1] == 0:
         raise InvalidInputError(f"{name}: expected the port that the service listens on, got {address!r}")
     return address
-
-
-_PROXY_VARIABLES = ("grpc_proxy", "https_proxy", "http_proxy")
-"""The variables from which gRPC takes a proxy, in its order."""
 
 
 def is_local(address: str) -> bool:
@@ -100,13 +123,6 @@ def _options(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]]) 
     return [*options, *proxy_options(address), *name]
 
 
-MAX_MESSAGE_BYTES = 16 << 20
-"""Both ends refuse larger messages; a frame of two megapixels with PNG depth needs a fraction of it."""
-
-KEEPALIVE_S = 15.0
-"""Either end sends a ping after this time without data, and closes the connection if no answer comes within it."""
-
-
 def connection_options(keepalive_s: float) -> tuple[tuple[str, int], ...]:
     """Return the gRPC options of either end; without pings, a watcher would not notice a lost network."""
     return (
@@ -118,24 +134,7 @@ def connection_options(keepalive_s: float) -> tuple[tuple[str, int], ...]:
     )
 
 
-DEADLINE_S = 30.0
-_REQUESTS_END_S = 1.0
-_RETRIED_METHODS = {
-    "gausslite.v1.ParserService": ("ParseTask",),
-    "gausslite.v1.AgentService": ("AssignTask", "EndMission", "GetAgentStatus", "RenderView"),
-    "gausslite.v1.FusionService": ("JoinSession", "GetSessionStatus", "QueryObjects", "ReportObjects", "LeaveSession"),
-}
-_RETRY_POLICY = {
-    "maxAttempts": 4,
-    "initialBackoff": "0.2s",
-    "maxBackoff": "2s",
-    "backoffMultiplier": 2,
-    "retryableStatusCodes": ["UNAVAILABLE"],
-}
-_METHODS = [{"service": service, "method": name} for service, names in _RETRIED_METHODS.items() for name in names]
-_SERVICE_CONFIG = json.dumps({"methodConfig": [{"name": _METHODS, "retryPolicy": _RETRY_POLICY}]})
 _Client = TypeVar("_Client", bound="ServiceChannel")
-_Response = TypeVar("_Response")
 
 
 class ServiceChannel:
@@ -250,10 +249,6 @@ class _RequestReader:
             self._thread.join(_REQUESTS_END_S)
 
 
-_DEADLINE_S = 3.0
-_SERVING = health_pb2.HealthCheckResponse.SERVING
-
-
 def require_serving(address: str, tls: Tls | None, service: str = "") -> None:
     """Raise UnavailableError if the service at this address does not answer SERVING within seconds."""
     if _status(address, service, tls) != _SERVING:
@@ -279,10 +274,6 @@ def _status(address: str, service: str, tls: Tls | None) -> int:
         if error.code() is grpc.StatusCode.NOT_FOUND:
             return int(health_pb2.HealthCheckResponse.SERVICE_UNKNOWN)
         raise UnavailableError(str(_raised(error, address, address))) from None
-
-
-_MAX_BACKOFF_S = 5.0
-_MAX_RETRY_HINT_S = 60.0
 
 
 class RetryDelay:

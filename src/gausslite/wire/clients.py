@@ -52,17 +52,16 @@ FrameOutcome = agent_pb.FrameOutcome
 """Names the outcomes of `AgentClient.ingest`: `FrameOutcome.Name(result.outcome)`."""
 Session = pb.JoinSessionResponse
 """The fusion server's answer to a joining agent."""
+_View = tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]
+UNKNOWN: Final = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
 class Export:
     """The map to download: `vote`, `concatenation` or `refined`; with an agent's id only its contribution."""
 
-    strategy: str = "vote"
+    strategy: str = "vote"  # the layer
     agent_id: str = ""
-
-
-_View = tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]
 
 
 def _decode_view(response: Any, camera: Camera) -> _View:
@@ -178,9 +177,6 @@ def _fitting_message(frame: Frame, lossless: bool, lens: Lens | None) -> geometr
 def is_done(status: agent_pb.GetAgentStatusResponse) -> bool:
     """True after the agent has ended its mission and written its results."""
     return status.state == agent_pb.AGENT_STATE_ENDED
-
-
-UNKNOWN: Final = "unknown"
 
 
 class FusionClient(ServiceChannel):

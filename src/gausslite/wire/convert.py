@@ -29,6 +29,17 @@ _CAMERA = tuple(field.name for field in fields(Camera))
 
 
 _Named = TypeVar("_Named", bound=Enum)
+_TILES_PER_MESSAGE = 1 << 14
+_MAX_TILES = 1 << 22
+JPEG_QUALITY = 95
+PNG_COMPRESSION = 1
+"""Level 6 takes three times longer and saves a quarter of the bytes; level 9 takes another ten times longer."""
+KEYFRAME_JPEG_QUALITY = 85
+"""In full resolution of colour: halved, it fades on small objects, and quality 90 needs as many bytes."""
+KEYFRAME_PNG_COMPRESSION = 6
+"""Keyframes are sent once, and compete for a robot's bandwidth."""
+_MM_PER_M = 1000.0
+MAX_IMAGE_PX = 1 << 23
 
 
 def enum_numbers(kind: Any, values: Iterable[_Named]) -> dict[_Named, Any]:
@@ -76,10 +87,6 @@ def _velocity(name: str, point: geometry_pb2.Point) -> Float64[ndarray, "3"]:
     return velocity
 
 
-_TILES_PER_MESSAGE = 1 << 14
-_MAX_TILES = 1 << 22
-
-
 def digests_to_messages(digests: TileDigests) -> Iterator[pb.GetUpdateDigestsResponse]:
     """Yield messages of 16 bytes per tile, at most 256 KiB each; none without tiles."""
     for start in range(0, len(digests.tiles), _TILES_PER_MESSAGE):
@@ -100,16 +107,6 @@ def digests_from_messages(messages: Iterable[pb.GetUpdateDigestsResponse]) -> Ti
             )
         parts.append(TileDigests(tiles, hashes))
     return TileDigests.sum_of(parts)
-
-
-JPEG_QUALITY = 95
-PNG_COMPRESSION = 1
-"""Level 6 takes three times longer and saves a quarter of the bytes; level 9 takes another ten times longer."""
-KEYFRAME_JPEG_QUALITY = 85
-"""In full resolution of colour: halved, it fades on small objects, and quality 90 needs as many bytes."""
-KEYFRAME_PNG_COMPRESSION = 6
-"""Keyframes are sent once, and compete for a robot's bandwidth."""
-_MM_PER_M = 1000.0
 
 
 def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False, quality: int = JPEG_QUALITY) -> bytes:
@@ -187,9 +184,6 @@ def _decode(name: str, data: bytes, shape: tuple[int, ...], dtype: type[np.integ
     return image
 
 
-MAX_IMAGE_PX = 1 << 23
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
     """Some voxel updates of a map at one revision. winners names the agent of each voxel; empty for an agent's map.
@@ -199,10 +193,10 @@ class MapUpdate:
 
     revision: int
     snapshot: bool
-    first: bool
+    first: bool  # the first message of its revision
     last: bool
     batch: VoxelBatch | None
-    grid: VoxelGrid | None
+    grid: VoxelGrid | None  # None without voxels
     winners: tuple[str, ...]
 
     def apply_to(self, batch: VoxelBatch) -> VoxelBatch:

@@ -51,6 +51,10 @@ _ROLE_BY_NUMBER = {0: TargetRole.OBJECT, **{number: role for role, number in _RO
 _SUPERLATIVE_BY_NUMBER = {number: superlative for superlative, number in _SUPERLATIVE_NUMBERS.items()}
 _NAMES = ("targets", "anchors", "warnings", "excluded", "context")
 _RELATION = ("target", "anchor", "negated", "min_m", "max_m")
+_ROLES = enum_numbers(objects_pb2.ObjectRole, ObjectRole)
+_OBJECT_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
+_LANDMARK = ("noun", "confidence", "first_seen_ns", "last_seen_ns")
+_OBSERVER = tuple(field.name for field in fields(ObjectObserver))
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
@@ -185,12 +189,6 @@ def _relation_from_message(message: task_pb2.Relation) -> Relation:
         min_m=message.min_m if message.HasField("min_m") else None,
         max_m=message.max_m if message.HasField("max_m") else None,
     )
-
-
-_ROLES = enum_numbers(objects_pb2.ObjectRole, ObjectRole)
-_OBJECT_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
-_LANDMARK = ("noun", "confidence", "first_seen_ns", "last_seen_ns")
-_OBSERVER = tuple(field.name for field in fields(ObjectObserver))
 
 
 def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserver] = ()) -> objects_pb2.ObjectLandmark:

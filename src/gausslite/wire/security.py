@@ -28,6 +28,19 @@ _DNS_NAMES, _URIS = "peer_dns", "peer_uri"
 _ROLE_PREFIX = "gausslite:role:"
 # every certificate of make_certificates.sh names it, for the health check
 _LOCALHOST = "localhost"
+_PERIOD_S = 60.0
+_MAX_ENTRIES = 1000
+_CONTRIBUTE = (
+    "JoinSession ContributeSubsets ContributeKeyframes ReportObjects KeepSession GetUpdateDigests LeaveSession"
+)
+_SHARE = "StorePart BeginAgent RemoveAgent ReadVoxels WatchFusedMap GetSessionStatus GetUpdateDigests CallHome"
+_BURST_S = 1.0
+MESSAGE_BYTES = 4096
+"""The cost of a message beside its own bytes; it limits the rate of small messages."""
+_RETRY_AFTER_S = 5.0
+_LARGE_BYTES, _UNREAD_BYTES, _UNREAD_OF_ONE = 1 << 16, 128 << 20, 32 << 20
+_READ_DEADLINE_S = 60.0
+_HANDSHAKE_S = 10.0
 
 
 class Role(StrEnum):
@@ -41,9 +54,9 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """The other end of a call. host: its IP address, or "unix"; names, roles: of its certificate, None without one."""
+    """The other end of a call. names, roles: of its certificate, None without one."""
 
-    host: str
+    host: str  # its IP address, or "unix"
     names: frozenset[str] | None = None
     roles: frozenset[Role] = frozenset()
 
@@ -97,10 +110,6 @@ def _host(peer: str) -> str:
     return str(mapped or parsed)
 
 
-_PERIOD_S = 60.0
-_MAX_ENTRIES = 1000
-
-
 class RejectionLog:
     """Counts refusals by caller and reason. Use it from one thread. clock_s: the time in seconds."""
 
@@ -131,10 +140,6 @@ class RejectionLog:
 
 _ANY = frozenset({Role.ROBOT, Role.VIEWER, Role.OPERATOR})
 _ROBOT, _OPERATOR, _SERVER = (frozenset({role}) for role in (Role.ROBOT, Role.OPERATOR, Role.SERVER))
-_CONTRIBUTE = (
-    "JoinSession ContributeSubsets ContributeKeyframes ReportObjects KeepSession GetUpdateDigests LeaveSession"
-)
-_SHARE = "StorePart BeginAgent RemoveAgent ReadVoxels WatchFusedMap GetSessionStatus GetUpdateDigests CallHome"
 _METHODS = (
     ("Parser", _ANY, "ParseTask"),
     ("Agent", _OPERATOR, "AssignTask EndMission"),
@@ -297,9 +302,6 @@ def caller_or_connection(context: Any) -> str:
     return str(context.peer()) if caller.names is None and caller.is_local else caller.key
 
 
-_BURST_S = 1.0
-
-
 class TokenBucket:
     """A token bucket in bytes that fills with time; one batch may overdraw it."""
 
@@ -332,27 +334,14 @@ class TokenBucket:
         self._bytes -= count
 
 
-MESSAGE_BYTES = 4096
-"""The cost of a message beside its own bytes; it limits the rate of small messages."""
-_RETRY_AFTER_S = 5.0
-_LARGE_BYTES, _UNREAD_BYTES, _UNREAD_OF_ONE = 1 << 16, 128 << 20, 32 << 20
-_READ_DEADLINE_S = 60.0
-_HANDSHAKE_S = 10.0
-
-
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Limits of a server.
+    """Limits of a server; the number of connections is that of all callers together."""
 
-    calls: open calls of one caller, streams and watchers included; kbps: bandwidth of one caller's requests, in
-    kilobits per second; connections: of all callers together; idle_s: time after which a connection without an open
-    call is closed.
-    """
-
-    calls: int = 64
-    kbps: int = 200_000
+    calls: int = 64  # open calls of one caller, streams and watchers included
+    kbps: int = 200_000  # bandwidth of one caller's requests, in kilobits per second
     connections: int = option(1000, "largest number of connections", key="limit-connections", low=1)
-    idle_s: int = 60
+    idle_s: int = 60  # time after which a connection without an open call is closed
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -37,19 +37,30 @@ LIVENESS = "liveness"
 """A name that health checks answer with SERVING while the process runs, so that a full disk restarts no container."""
 Check = Callable[[], None]
 """Raises GaussLiteError while the service cannot work."""
+_LAST_CALLS_S = 1.0
+_HEALTH_LIMITS = security.CallLimits(connections=64, idle_s=10)
+# the longest path of a unix socket that Linux accepts
+_MAX_SOCKET_PATH_BYTES = 107
+_OPTIONS = (
+    *connection_options(KEEPALIVE_S),
+    # gRPC would close a connection whose client pings this often without sending data
+    ("grpc.http2.min_ping_interval_without_data_ms", round(500 * KEEPALIVE_S)),
+    # else gRPC receives megabytes ahead on each stream, as fast as a client sends; a message that is read is exempt
+    ("grpc.http2.bdp_probe", 0),
+    # a second server must fail to bind the port instead of sharing it
+    ("grpc.so_reuseport", 0),
+)
+_ARITY = {False: "unary", True: "stream"}
 
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A servicer's full name, a function that adds it to a server, and its checks.
-
-    check: may block; it runs in a thread. check_progress: must not block; it is called every second.
-    """
+    """A servicer's full name, a function that adds it to a server, and its checks."""
 
     name: str
     register: Callable[[grpc.aio.Server], None]
-    check: Check = lambda: None
-    check_progress: Check = lambda: None
+    check: Check = lambda: None  # may block; it runs in a thread
+    check_progress: Check = lambda: None  # must not block; it is called every second
 
 
 class ReadinessWatch:
@@ -108,21 +119,6 @@ class ReadinessWatch:
             raise UnavailableError(f"the check has not ended within {_CHECK_LIMIT_S:g} s")
         checked, self._checking = self._checking, None
         checked.result()
-
-
-_LAST_CALLS_S = 1.0
-_HEALTH_LIMITS = security.CallLimits(connections=64, idle_s=10)
-# the longest path of a unix socket that Linux accepts
-_MAX_SOCKET_PATH_BYTES = 107
-_OPTIONS = (
-    *connection_options(KEEPALIVE_S),
-    # gRPC would close a connection whose client pings this often without sending data
-    ("grpc.http2.min_ping_interval_without_data_ms", round(500 * KEEPALIVE_S)),
-    # else gRPC receives megabytes ahead on each stream, as fast as a client sends; a message that is read is exempt
-    ("grpc.http2.bdp_probe", 0),
-    # a second server must fail to bind the port instead of sharing it
-    ("grpc.so_reuseport", 0),
-)
 
 
 class RunningServer:
@@ -248,9 +244,6 @@ class _Method:
             raise InvalidInputError(
                 f"{self.name}: expected its request message, got {len(data)} invalid bytes"
             ) from error
-
-
-_ARITY = {False: "unary", True: "stream"}
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]

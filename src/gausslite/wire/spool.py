@@ -42,23 +42,6 @@ from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class SpooledKeyframe:
-    """A keyframe to send.
-
-    value: what the server gains, in units of kappa. coverage: what the agent needs to know of it after a restart; the
-    spool does not read it. data: the EncodedFrame. enqueue_count: how often this frame was enqueued.
-    """
-
-    frame_index: int
-    value: float
-    coverage: bytes
-    data: bytes
-    enqueue_count: int = 0
-
-
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
 _SLICE = 500
@@ -117,6 +100,17 @@ SELECT -value / length(data), frame_index, length(data), 1 FROM keyframes WHERE 
 """
 
 
+@dataclass(frozen=True, slots=True)
+class SpooledKeyframe:
+    """A keyframe to send."""
+
+    frame_index: int
+    value: float  # what the server gains, in units of kappa
+    coverage: bytes  # what the agent needs to know of it after a restart; the spool does not read it
+    data: bytes  # the EncodedFrame
+    enqueue_count: int = 0  # how often this frame was enqueued
+
+
 class _Due(NamedTuple):
     """A pending voxel or keyframe in the order of sending, with its size on the wire."""
 
@@ -141,7 +135,7 @@ class SpoolBatch:
     newer update of the voxel is pending.
     """
 
-    purpose: Purpose
+    purpose: Purpose  # the region, or the handover
     batch: VoxelBatch
     enqueue_counts: Int64[ndarray, " v"]
 

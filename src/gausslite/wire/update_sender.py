@@ -22,6 +22,8 @@ from gausslite.wire.convert import enum_numbers
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 
 _log = logging.getLogger(__name__)
+_MIN_SUBSET_BYTES = 1 << 16
+_PURPOSES = enum_numbers(pb.Purpose, Purpose)
 
 
 def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
@@ -37,23 +39,19 @@ def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
 class UplinkSettings:
     """Limits and intervals of sending.
 
-    interval_s: minimum time between rounds, so that several changes of a voxel are sent as one. resend_threshold:
-    change of a voxel's Σkappa, as a share of the sent value, from which it is sent a second time, see
+    resend_threshold: change of a voxel's Σkappa, as a share of the sent value, from which it is sent a second time, see
     `Spool.next_round`; 0 while the uplink drains.
-    round_bytes: size limit of a round. deadline_s: of each call. first_backoff_s: wait before the first retry.
-    check_interval_s: how often an idle uplink asks the server whether it still has everything. T_fused_agent: declared
-    pose of the agent's frame in the fused map's; None: not declared. frame: whether the agent's frame is the team's.
     """
 
     kbps: float | None = option(
         None, "bandwidth limit in kilobits per second (default: none)", key="uplink-kbps", unit="kbit/s", low=0.001
     )
-    interval_s: float = 1.0
+    interval_s: float = 1.0  # minimum time between rounds, so that several changes of a voxel are sent as one
     resend_threshold: float = 0.5
-    round_bytes: int = 4 << 20
-    deadline_s: float = 30.0
-    first_backoff_s: float = 0.2
-    check_interval_s: float = 10.0
+    round_bytes: int = 4 << 20  # size limit of a round
+    deadline_s: float = 30.0  # of each call
+    first_backoff_s: float = 0.2  # wait before the first retry
+    check_interval_s: float = 10.0  # how often an idle uplink asks the server whether it still has everything
     world_frame: str = option("", "name of the frame of all poses (default: the server's)", metavar="NAME")
     T_fused_agent: Float64[ndarray, "4 4"] | None = option(
         None,
@@ -63,10 +61,10 @@ class UplinkSettings:
         plain_type=str,
         convert=read_rigid_transform,
         excludes="frame",
-    )
+    )  # declared pose of the agent's frame in the fused map's; None: not declared
     frame: str = option(
         "team", "the agent's world frame; the server searches the pose of an unknown one", choices=("team", UNKNOWN)
-    )
+    )  # whether the agent's frame is the team's
 
     @property
     def declared_frame(self) -> Float64[ndarray, "4 4"] | Literal["unknown"] | None:
@@ -88,11 +86,10 @@ class UplinkCounters:
 
     voxels_sent counts each voxel of the task's region once; voxels_waiting: voxels in the spool with a pending update.
     keyframes_sent counts each acknowledged keyframe once; keyframe_bytes has their bytes, resends included.
-    stopped_because: the error that stopped the uplink, empty while it runs.
     """
 
-    roi_bytes: int = 0
-    handover_bytes: int = 0
+    roi_bytes: int = 0  # of the region's voxels, while the mission runs
+    handover_bytes: int = 0  # of the rest, after it
     gaussians_sent: int = 0
     voxels_sent: int = 0
     voxels_waiting: int = 0
@@ -101,9 +98,9 @@ class UplinkCounters:
     keyframe_bytes: int = 0
     subsets_sent: int = 0
     subsets_rejected: int = 0
-    joins: int = 0
+    joins: int = 0  # sessions that were opened
     connected: bool = False
-    stopped_because: str = ""
+    stopped_because: str = ""  # the error that stopped the uplink, empty while it runs
 
     @property
     def bytes_sent(self) -> int:
@@ -117,11 +114,7 @@ class SentPart:
 
     batch: SpoolBatch
     request: pb.ContributeSubsetsRequest
-    update_seq: int
-
-
-_MIN_SUBSET_BYTES = 1 << 16
-_PURPOSES = enum_numbers(pb.Purpose, Purpose)
+    update_seq: int  # the highest one in the message
 
 
 class UpdateSender:

@@ -20,6 +20,9 @@ MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
 _MAX_VIEW_PX = 1920 * 1080
 MAX_VIEWS_WAITING = 16
 _SIDES = ("left_px", "top_px", "right_px", "bottom_px")
+_NOTIFY_PAUSE_S = 0.1
+_SUBSCRIPTION_PAUSE_S = 0.005
+"""Serving a watcher takes about a millisecond, and it subscribes twice for each change."""
 
 
 def view_camera_from_message(message: geometry_pb2.Camera) -> Camera:
@@ -85,11 +88,6 @@ def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
     """Return the positions of at most this many of `count` values, evenly spaced, with the first and the last."""
     positions: Int64[ndarray, " n"] = np.unique(np.linspace(0, max(count - 1, 0), min(count, highest)).astype(np.int64))
     return positions
-
-
-_NOTIFY_PAUSE_S = 0.1
-_SUBSCRIPTION_PAUSE_S = 0.005
-"""Serving a watcher takes about a millisecond, and it subscribes twice for each change."""
 
 
 class ChangeNotifier:

@@ -22,6 +22,7 @@ from gausslite.perception.relevance_tracker import merge_masks
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 
 _MIN_FOUND_SHARE = 0.25
+_CONFIRM_ALL = EvidenceSettings(1, 0.0, 0.0, np.inf, 0.0)
 
 
 class PerceptionStage(StrEnum):
@@ -121,7 +122,7 @@ class _TaskEvaluation:
         self._query, self._detector = query, detector
         every_frame = RelevanceTrackerSettings(up_axis=up_axis, max_frames=1)
         settings = {
-            PerceptionStage.RELATED: replace(every_frame, evidence=EvidenceSettings.accept_all()),
+            PerceptionStage.RELATED: replace(every_frame, evidence=_CONFIRM_ALL),
             PerceptionStage.CONFIRMED: every_frame,
             PerceptionStage.TRACKED: RelevanceTrackerSettings(up_axis=up_axis),
         }

@@ -10,6 +10,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion.keyframe_pool import AgentKeyframe
+from gausslite.mapping.free_space import without_guesses
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import build_mapper
@@ -95,7 +96,7 @@ def map_agent(agent: AgentScene, settings: MissionSettings, grid: VoxelGrid) -> 
     keyframes = tuple(
         AgentKeyframe(agent.agent_id, keyframe) for keyframe in _select_keyframes(mapper.keyframes(), grid)
     )
-    gaussians = gaussian_mapper.shared_gaussians()
+    gaussians = without_guesses(gaussian_mapper.gaussians(), (kept.frame for kept in gaussian_mapper.store.kept))
     return AgentMap(
         agent_id=agent.agent_id,
         gaussians=gaussians,

@@ -24,11 +24,7 @@ ROWS = re.findall(r"^\| (\d+) \| .+ \| (?:`gausslite (.+)` )?\|$", PAGE.read_tex
 
 @pytest.mark.parametrize(("code", "example"), [row for row in ROWS if row[1]])
 def test_the_examples_of_the_page_have_the_stated_codes(
-    code: str,
-    example: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    code: str, example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "notes.txt").write_text("a file")

@@ -54,11 +54,7 @@ class Settings:
 
 def parser_of_settings() -> CommandParser:
     parser = CommandParser(prog="mapper")
-    Program.of(
-        Settings,
-        flags="out max-items rate steps names ball verbose colour",
-        positional="source",
-    ).add_to(parser)
+    Program.of(Settings, flags="out max-items rate steps names ball verbose colour", positional="source").add_to(parser)
     return parser
 
 

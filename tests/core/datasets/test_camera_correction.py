@@ -25,8 +25,7 @@ def test_the_identity_is_recognised_and_text_round_trips() -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "readout", "readout=x", "readout=0.5", "offset=2", "speed=1", "readout=0;readout=0", "exposure=-1"],
+    "text", ["", "readout", "readout=x", "readout=0.5", "offset=2", "speed=1", "readout=0;readout=0", "exposure=-1"]
 )
 def test_a_wrong_correction_is_rejected(text: str) -> None:
     with pytest.raises(InvalidInputError, match=r"camera|lens"):

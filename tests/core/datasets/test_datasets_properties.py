@@ -79,12 +79,7 @@ def test_interpolation_is_linear_in_the_angle(seed: int, share: float) -> None:
     assert abs(float(mixed @ opposite)) == pytest.approx(1.0)
 
 
-@given(
-    st.sets(st.integers(0, 200), min_size=1),
-    st.integers(0, 210),
-    st.integers(1, 210),
-    st.integers(1, 30),
-)
+@given(st.sets(st.integers(0, 200), min_size=1), st.integers(0, 210), st.integers(1, 210), st.integers(1, 30))
 def test_a_selection_is_a_range_of_numbers(numbers: set[int], start: int, length: int, step: int) -> None:
     source = Numbered(sorted(numbers))
     expected = [n for n in sorted(numbers) if n in range(start, start + length, step)]

@@ -12,7 +12,6 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import Trajectory, Twist
 
 TURN = Twist(np.zeros(3), np.array([0.0, 1.0, 0.0]))
-NO_RAY = (np.array([0.1, 2.0]), np.array([0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -32,7 +31,6 @@ NO_RAY = (np.array([0.1, 2.0]), np.array([0.0, 0.0]))
             (lambda text=text: Lens.parse(text), "lens")
             for text in ("", "radtan", "radtan:1,2", "fisheye:1,2,3,4,5", "radtan:a,b,c,d", "radtan:nan,0,0,0")
         ),
-        (lambda: Lens.parse("radtan:-1,0,0,0").undistort(*NO_RAY), "inverted"),
         (lambda: Trajectory(np.array([1.0, 0.0]), np.stack([np.eye(4)] * 2)), "ascending"),
     ],
 )

@@ -33,11 +33,3 @@ def test_fisheye_distortion_equals_opencv_and_is_defined_on_the_axis() -> None:
 def test_text_form_round_trips() -> None:
     lens = Lens.parse("radtan:0.2624,-0.9531,-0.0054,0.0026,1.1633")
     assert Lens.parse(str(lens)) == lens
-
-
-@pytest.mark.parametrize(
-    "text", ["radtan:-0.2,0.05,0.002,-0.001", "radtan:0.2624,-0.9531,-0.0054,0.0026,1.1633", "fisheye:0.1,0.02,0,0"]
-)
-def test_undistorted_points_are_distorted_back_to_where_they_were(text: str) -> None:
-    lens, points = Lens.parse(text), 0.8 * SLOPES
-    np.testing.assert_allclose(lens.distort(*lens.undistort(*points)), points, atol=1e-6)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fusion_running import GRID, keys, make_subset
 from opened_stores import OpenStore, opener
 
 from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
+from gausslite.domain.pose import transform_of
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.epochs import MAX_FORMER_MAPS, is_former
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
@@ -160,5 +162,10 @@ def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPat
     work(engine)
     send(engine, session, 1, {cell: [1] for cell in range(50, 100)})
     assert fused_kappas(engine) == dict.fromkeys(range(50, 100), 1)
+    # voxels in another frame take more, where they lie and where they came from
+    engine.declare_frame("ant", transform_of(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    work(engine)
+    with pytest.raises(QuotaError, match="at most 5000 bytes"):
+        send(engine, session, 2, {cell: [2] for cell in range(50, 60)})
     monkeypatch.setattr("gausslite.fusion.limits._CONTAINER_LIMITS", ())
     assert FusionSettings(grid=GRID).agent_bytes > 1 << 20

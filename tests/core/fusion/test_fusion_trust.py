@@ -28,9 +28,10 @@ from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.keyframe_pool import EncodedKeyframe
+from gausslite.fusion.keyframe_pool import ORDER_RECORD, EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas, SessionRecord
-from gausslite.fusion.membership import SessionRegistry
+from gausslite.fusion.membership import TOKEN_RECORD, SessionRegistry
+from gausslite.fusion.objects import RECORD
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.updates import MAX_SEQ_STEP, MissionClock, UpdateChecks
@@ -190,7 +191,8 @@ def test_what_is_being_written_when_its_agent_is_evicted_is_deleted_too(
         assert engine.evict("ant") == 0
         with suppress(SessionUnknownError):
             writing.result(60)
-    assert (store.keyframe_sizes(), store._read("SELECT name FROM records WHERE agent_id = 'ant'")) == ({}, [])
+    assert store.keyframe_sizes() == {}
+    assert not any(store.find_record("ant", record) for record in (RECORD, ORDER_RECORD, TOKEN_RECORD))
     assert engine.status().agents == ()
     with pytest.raises(SessionUnknownError):
         write()

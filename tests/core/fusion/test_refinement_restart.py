@@ -151,8 +151,10 @@ def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_an
     engine.store.close()
 
 
-@pytest.mark.parametrize("evicted", ["cat", "bee"])
-def test_evicting_an_agent_undoes_the_refinement_that_its_keyframes_shaped(tmp_path: Path, evicted: str) -> None:
+@pytest.mark.parametrize("gone", ["cat", "bee", "frame of cat"])
+def test_an_agent_that_is_used_no_more_takes_the_refinement_along_that_its_keyframes_shaped(
+    tmp_path: Path, gone: str
+) -> None:
     path = tmp_path / "store.sqlite"
     engine = open_engine(path)
     ant, _, cat = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee", "cat"))
@@ -162,15 +164,18 @@ def test_evicting_an_agent_undoes_the_refinement_that_its_keyframes_shaped(tmp_p
     voted, revision = shown(engine), engine.maps.revision()
     engine.store_refined(red(engine.maps.voted_map().gaussians), revision, ("ant", "cat"))
     refined, since = shown(engine), engine.maps.revision(MapLayer.REFINED)
-    engine.evict(evicted, ban=True)
-    expected = voted if evicted == "cat" else refined
-    assert shown(engine) == expected != (refined if evicted == "cat" else voted)
+    if gone == "frame of cat":
+        engine.declare_frame("cat", None)
+    else:
+        engine.evict(gone, ban=True)
+    expected = voted if gone != "bee" else refined
+    assert shown(engine) == expected != (refined if gone != "bee" else voted)
     # watchers of the layer see the vote again
     changed = engine.maps.changes(since, MapLayer.REFINED).won.batch
-    assert len(changed) == (10 if evicted == "cat" else 0)
+    assert len(changed) == (10 if gone != "bee" else 0)
     engine = restart(engine, path)
     assert shown(engine) == expected
-    assert engine.status().refined == (evicted == "bee")
+    assert engine.status().refined == (gone == "bee")
     # one that ran meanwhile is not stored
     with pytest.raises(MismatchError, match="the keyframes of dog to stay"):
         engine.store_refined(red(engine.maps.voted_map().gaussians), engine.maps.revision(), ("ant", "dog"))

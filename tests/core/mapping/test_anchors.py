@@ -96,10 +96,7 @@ def test_seeds_get_the_anchor_of_their_frame_and_children_inherit_it() -> None:
 
 def test_moved_voxels_are_sent_once_and_their_old_places_become_tombstones() -> None:
     table = SplatTable(10)
-    still, moving = (
-        gaussians(4, True, np.random.default_rng(5)),
-        gaussians(3, True, np.random.default_rng(6)),
-    )
+    still, moving = (gaussians(4, True, np.random.default_rng(5)), gaussians(3, True, np.random.default_rng(6)))
     for anchor, placed in enumerate((still, moving)):
         placed.means_m[:] = (0.05 + 2.0 * anchor, 0.05, 0.05)
         table.append(placed, anchor)

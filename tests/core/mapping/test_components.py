@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import Components, DensitySettings, KeyframeSettings, MapperSettings, SeedingSettings
@@ -30,8 +30,8 @@ def test_every_combination_maps_within_the_cap(switches: tuple[bool, ...]) -> No
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(2):
         frame = wall_frame(index, SIZE, shift_m=0.2 * index)
-        mapper.map_frame(frame, middle_relevance(frame))
-        assert 0 < mapper.count <= 150
+        map_frame(mapper, frame)
+        assert 0 < mapper.table.count <= 150
     gaussians = mapper.gaussians()
     assert np.isfinite(gaussians.means_m).all()
     assert gaussians.active.any()

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import wall_frame
+from mapping_scenes import map_frame, wall_frame
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite.mapping.free_space import DepthView, has_guessed_depth, seen_through, view_counts
+from gausslite.mapping.free_space import DepthView, has_guessed_depth, seen_through, view_counts, without_guesses
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
@@ -78,8 +78,9 @@ def test_only_untrained_guesses_are_kept_from_others() -> None:
     depth_m = frame.depth_m.copy()
     depth_m[:, 32:] = 0.0
     no_relevance = RelevanceMap(np.zeros(depth_m.shape, np.float32), np.full(depth_m.shape, -1, np.int16))
-    mapper.map_frame(replace(frame, depth_m=depth_m), no_relevance)
-    shared, whole = mapper.shared_gaussians(), mapper.gaussians()
+    map_frame(mapper, replace(frame, depth_m=depth_m), no_relevance)
+    whole = mapper.gaussians()
+    shared = without_guesses(whole, (keyframe.frame for keyframe in mapper.store.kept))
     assert len(whole) - len(shared) == 4
     assert np.count_nonzero(shared.means_m[:, 2] > 4.5) == 1
 
@@ -102,8 +103,10 @@ def _prior() -> Gaussians:
 def _map(mapper: GaussianMapper, frames: int) -> None:
     for index in range(frames):
         frame = wall_frame(index, shift_m=0.05 * index)
-        mapper.map_frame(
-            frame, RelevanceMap(np.ones(frame.depth_m.shape, np.float32), np.zeros(frame.depth_m.shape, np.int16))
+        map_frame(
+            mapper,
+            frame,
+            RelevanceMap(np.ones(frame.depth_m.shape, np.float32), np.zeros(frame.depth_m.shape, np.int16)),
         )
 
 

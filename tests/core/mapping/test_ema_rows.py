@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gausslite.domain.gaussians import Gaussians
@@ -132,7 +132,7 @@ def map_of(ema_updates: float) -> GaussianMapper:
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(4):
         frame = wall_frame(index, (48, 32), shift_m=0.1 * index)
-        mapper.map_frame(frame, middle_relevance(frame))
+        map_frame(mapper, frame)
     return mapper
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, middle_relevance, wall_frame
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import PoseExposurePrior
@@ -45,8 +45,8 @@ def mapper_of(settings: MapperSettings = SMALL, seed: int = 0) -> GaussianMapper
 def map_wall(mapper: GaussianMapper, frames: int) -> None:
     for index in range(frames):
         frame = wall_frame(index, SIZE, shift_m=0.1 * index)
-        mapper.map_frame(frame, middle_relevance(frame))
-        assert mapper.count <= mapper.settings.max_gaussians
+        map_frame(mapper, frame)
+        assert mapper.table.count <= mapper.settings.max_gaussians
 
 
 def region_error(mapper: GaussianMapper) -> float:
@@ -59,7 +59,7 @@ def test_an_outlier_depth_does_not_enlarge_the_scene_extent() -> None:
     mapper = mapper_of()
     frame = wall_frame(0, SIZE)
     frame.depth_m[3, 5] = 60.0
-    mapper.map_frame(frame, middle_relevance(frame))
+    map_frame(mapper, frame)
     farthest_m = mapper.settings.seeding.max_depth_m
     assert mapper.state()["extent_m"] == pytest.approx([farthest_m / 3])
 
@@ -98,7 +98,7 @@ def test_gradients_have_similar_size_in_active_phase_and_warm_up(loss: LossWeigh
 def test_without_a_view_of_the_region_all_iterations_are_warm_up() -> None:
     mapper = mapper_of()
     frame = wall_frame(0, SIZE)
-    outcome = mapper.map_frame(frame, RelevanceMap.empty(*frame.depth_m.shape))
+    outcome = map_frame(mapper, frame, RelevanceMap.empty(*frame.depth_m.shape))
     assert outcome.iterations == 8
     assert not mapper.gaussians().kappa.any()
     assert not mapper.gaussians().active.any()
@@ -109,7 +109,7 @@ def test_the_active_phase_trains_on_earlier_keyframes_of_the_region() -> None:
     map_wall(mapper, 1)
     before = int(mapper.gaussians().kappa.max())
     away = wall_frame(1, SIZE)
-    mapper.map_frame(away, RelevanceMap.empty(*away.depth_m.shape))
+    map_frame(mapper, away, RelevanceMap.empty(*away.depth_m.shape))
     assert mapper.gaussians().kappa.max() > before
 
 
@@ -118,7 +118,7 @@ def test_each_kind_of_active_phase_trains_the_region(phase: ActivePhase) -> None
     optimization = OptimizationSettings(warmup_iterations=0, active_iterations=8, active_phase=phase)
     mapper = mapper_of(replace(SMALL, optimization=optimization, density=DensitySettings()))
     frame = wall_frame(0, SIZE)
-    mapper.map_frame(frame, middle_relevance(frame))
+    map_frame(mapper, frame)
     gaussians = mapper.gaussians()
     untrained = np.isclose(gaussians.opacities, 0.5, atol=1e-6)
     assert not untrained[gaussians.active & (gaussians.kappa > 0)].any()
@@ -132,9 +132,9 @@ def test_a_frame_without_depth_is_skipped_and_counted() -> None:
     mapper = mapper_of()
     frame = wall_frame(3, SIZE)
     frame.depth_m[:] = 0.0
-    outcome = mapper.map_frame(frame, middle_relevance(frame))
+    outcome = map_frame(mapper, frame)
     assert outcome.skipped == "no pixel has a depth reading"
-    assert (outcome.index, outcome.iterations, mapper.count, mapper.revision) == (3, 0, 0, 0)
+    assert (outcome.index, outcome.iterations, mapper.table.count, mapper.revision) == (3, 0, 0, 0)
 
 
 def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:
@@ -157,7 +157,7 @@ def test_a_scheduler_replaces_the_number_of_iterations_and_times_each_stage() ->
     )
     frame = wall_frame(0, SIZE)
     scheduler.begin()
-    outcome = mapper.map_frame(frame, middle_relevance(frame), scheduler)
+    outcome = map_frame(mapper, frame, scheduler=scheduler)
     timing = scheduler.end()
     assert 8 < outcome.iterations < 30
     # an iteration takes one second plus some clock readings
@@ -174,7 +174,7 @@ def test_a_frame_without_time_refines_no_earlier_keyframe(seconds_per_frame: flo
     scheduler = FrameScheduler(SchedulerSettings(seconds_per_frame), clock=lambda: float(next(clock)))
     frame = wall_frame(4, SIZE)
     scheduler.begin()
-    mapper.map_frame(frame, middle_relevance(frame), scheduler)
+    map_frame(mapper, frame, scheduler=scheduler)
     assert scheduler.end().stages_s.get(Stage.KEYFRAME_REFINEMENT, 0.0) == refined
 
 
@@ -191,7 +191,7 @@ def test_density_control_is_delayed_by_missing_time_but_not_forever() -> None:
     densified = []
     for _ in range(3):
         scheduler.begin()
-        iterations = mapper.map_frame(frame, middle_relevance(frame), scheduler).iterations
+        iterations = map_frame(mapper, frame, scheduler=scheduler).iterations
         densified.append((iterations, scheduler.end().stages_s.get(Stage.DENSIFICATION, 0.0)))
     assert densified[0][0] >= 20
     assert densified[0][1] > 0
@@ -213,7 +213,7 @@ def test_keyframes_are_every_nth_frame_and_the_frames_that_train_the_map() -> No
     for settings, expected in ((no_long_term, [0, 2, 4]), (SMALL, [0, 1, 2, 3, 4])):
         mapper = mapper_of(settings)
         map_wall(mapper, 5)
-        assert [keyframe.frame.index for keyframe in mapper.keyframes()] == expected
+        assert [keyframe.frame.index for keyframe in mapper.store.kept] == expected
 
 
 def test_policies_by_name() -> None:

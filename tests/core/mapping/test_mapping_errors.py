@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import wall_frame
+from mapping_scenes import map_frame, wall_frame
 
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.domain.relevance import RelevanceMap
@@ -27,7 +27,7 @@ from gausslite.render.cpu import CpuRasterizer
 
 def map_with_another_size() -> object:
     mapper = GaussianMapper(MapperSettings(max_gaussians=400), CpuRasterizer(threads=1), 0)
-    return mapper.map_frame(wall_frame(0, (48, 32)), RelevanceMap.empty(8, 8))
+    return map_frame(mapper, wall_frame(0, (48, 32)), RelevanceMap.empty(8, 8))
 
 
 @pytest.mark.parametrize(

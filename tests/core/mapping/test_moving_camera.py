@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.domain.camera import CameraMotion
@@ -43,7 +43,7 @@ def test_seeds_lie_on_the_surface_that_each_row_sees() -> None:
 def test_the_map_renders_what_the_moving_camera_sees() -> None:
     frame = approaching_frame()
     mapper = GaussianMapper(MapperSettings(max_gaussians=4000), ReferenceRasterizer(), seed=0)
-    mapper.map_frame(frame, middle_relevance(frame))
+    map_frame(mapper, frame)
     rendered = mapper.look(frame, CountedScheduler()).rendered
     assert rendered is not None
     seen = rendered.alpha > 0.8

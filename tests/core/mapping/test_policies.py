@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import (
@@ -32,7 +32,7 @@ def mapped(settings: MapperSettings, frames: int = 3) -> GaussianMapper:
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for index in range(frames):
         frame = wall_frame(index, shift_m=0.1 * index)
-        mapper.map_frame(frame, middle_relevance(frame))
+        map_frame(mapper, frame)
     return mapper
 
 
@@ -41,7 +41,7 @@ def test_every_policy_keeps_the_cap(name: str) -> None:
     settings = policy(name)
     assert settings.max_gaussians == MapperSettings().max_gaussians
     capped = MapperSettings(100, settings.components, settings.seeding, settings.keyframes, settings.optimization)
-    assert 0 < mapped(capped).count <= 100
+    assert 0 < mapped(capped).table.count <= 100
 
 
 @pytest.mark.parametrize("name", BASELINES)

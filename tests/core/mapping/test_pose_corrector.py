@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 
 from gausslite import plugins
 from gausslite.domain.errors import MissingPluginError
@@ -55,14 +55,15 @@ def _mapped(corrector: PoseCorrector | None, frames: int) -> GaussianMapper:
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), corrector=corrector)
     for index in range(frames):
         frame = wall_frame(index, shift_m=0.02 * index)
-        mapper.map_frame(frame, middle_relevance(frame))
+        map_frame(mapper, frame)
     return mapper
 
 
 def test_a_correction_moves_keyframes_and_the_odometry_to_come() -> None:
     mapper, plain = _mapped(_SecondMoves(), 2), _mapped(None, 2)
-    assert (mapper.loops.corrections, plain.loops) == (1, LoopCounts())
-    for moved, own in zip(mapper.keyframes(), plain.keyframes(), strict=True):
+    assert mapper.corrector is not None
+    assert mapper.corrector.counts.corrections == 1
+    for moved, own in zip(mapper.store.kept, plain.store.kept, strict=True):
         np.testing.assert_allclose(moved.frame.T_world_camera, MOTION @ own.frame.T_world_camera, atol=1e-9)
     frame = wall_frame(2)
     np.testing.assert_allclose(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
@@ -136,7 +136,7 @@ def test_frames_with_exact_poses_have_no_correction() -> None:
     mapper = GaussianMapper(MapperSettings(max_gaussians=500), CpuRasterizer(threads=1))
     for index in range(3):
         frame = wall_frame(index, shift_m=0.05 * index)
-        mapped = mapper.map_frame(frame, middle_relevance(frame))
+        mapped = map_frame(mapper, frame)
         assert mapped.T_world_camera is not None
         assert translation_m(mapped.T_world_camera, frame.T_world_camera) == 0
     corrections = mapper.poses.corrections()

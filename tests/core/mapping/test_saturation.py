@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, wall_frame
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
@@ -103,7 +103,7 @@ def counts_of(settings: MapperSettings, frames: list[Frame]) -> dict[Stage, int]
     counts: dict[Stage, int] = {}
     mapper = GaussianMapper(settings, CpuRasterizer(threads=1), seed=0)
     for frame in frames:
-        mapper.map_frame(frame, middle_relevance(frame), CountingScheduler(counts))
+        map_frame(mapper, frame, scheduler=CountingScheduler(counts))
     return counts
 
 

@@ -19,12 +19,7 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeds, insert_seeds, visible_means
-from gausslite.mapping.settings import (
-    DensitySettings,
-    KeyframeSettings,
-    MapperSettings,
-    SeedingSettings,
-)
+from gausslite.mapping.settings import DensitySettings, KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
@@ -40,14 +35,18 @@ A, B = RegionRelevanceEstimator([LEFT]), RegionRelevanceEstimator([RIGHT])
 GRID = VoxelGrid(0.25)
 
 
-def make_task_mapper(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: int = 4) -> TaskMapper:
+def make_mapper(max_gaussians: int = 1500, every: int = 1, buffer: int = 8, window: int = 4) -> GaussianMapper:
     settings = MapperSettings(
         max_gaussians=max_gaussians,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
         keyframes=KeyframeSettings(every=every, window=window, buffer=buffer, long_term_keyframes=2),
         density=DensitySettings(densify_every=7, prune_every=5),
     )
-    return TaskMapper(A, GaussianMapper(settings, CpuRasterizer(threads=1)), SentVoxelTracker(GRID))
+    return GaussianMapper(settings, CpuRasterizer(threads=1))
+
+
+def make_task_mapper(**settings: int) -> TaskMapper:
+    return TaskMapper(A, make_mapper(**settings), SentVoxelTracker(GRID))
 
 
 def frame_at(index: int) -> Frame:
@@ -144,8 +143,8 @@ def test_active_gaussians_follow_the_task_also_when_an_earlier_task_returns() ->
 
 
 def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
-    task_mapper = make_task_mapper(window=3, buffer=32)
-    mapper = task_mapper._mapper
+    mapper = make_mapper(window=3, buffer=32)
+    task_mapper = TaskMapper(A, mapper, SentVoxelTracker(GRID))
     for index in range(12):
         # the camera leaves the new region behind
         task_mapper.process(wall_frame(index, SIZE, shift_m=-0.1 * index))
@@ -158,7 +157,7 @@ def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
     assert mapper.store.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
     assert any(view.shows_roi for view in mapper.store.window)
-    for keyframe in mapper.keyframes():
+    for keyframe in mapper.store.kept:
         np.testing.assert_array_equal(keyframe.relevance.roi, RIGHT.mask(keyframe.frame))
 
 

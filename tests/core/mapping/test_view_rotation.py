@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_scenes import middle_relevance, wall_frame
+from mapping_scenes import map_frame, middle_relevance, wall_frame
 
 from gausslite.domain.errors import MapFileError
 from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
@@ -79,7 +79,7 @@ def test_an_iteration_on_large_whole_images_trains_four_in_half_size() -> None:
     )
     for size in ((161, 120), (160, 120)):
         frame = wall_frame(size=size)
-        GaussianMapper(settings, rasterizer, seed=0).map_frame(frame, middle_relevance(frame))
+        map_frame(GaussianMapper(settings, rasterizer, seed=0), frame)
     # 0.3 px², and 1/4 px² of the mean over 2x2 pixels, in pixels of twice the side
     assert rasterizer.steps == [(80, pytest.approx(0.1375))] * 8 + [(160, 0.3)] * 2
 
@@ -93,5 +93,5 @@ def test_an_active_iteration_trains_as_many_views_as_fit_in_one_image(share: flo
     relevance.pixel_weights[:] = 0
     relevance.pixel_weights[: int(160 * share)] = 1
     relevance.target[:] = np.where(relevance.pixel_weights > 0, 0, -1)
-    mapper.map_frame(frame, relevance)
+    map_frame(mapper, frame, relevance)
     assert mapper.gaussians().kappa.max() == steps

@@ -80,10 +80,7 @@ def test_a_missing_file_of_regions_is_not_reported(tmp_path: Path, capsys: pytes
 
 def test_a_corrupt_first_frame_is_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kitchen, tum = write_seven_scenes(tmp_path / "kitchen", FRAMES), write_tum(tmp_path / "fr1", frames=4)
-    for folder, path in (
-        (kitchen, kitchen / "frame-000000.color.png"),
-        (tum, tum / "rgb" / "0.png"),
-    ):
+    for folder, path in ((kitchen, kitchen / "frame-000000.color.png"), (tum, tum / "rgb" / "0.png")):
         path.write_bytes(b"not an image")
         out = tmp_path / f"out-{folder.name}"
         assert map_command(folder, out) == 0

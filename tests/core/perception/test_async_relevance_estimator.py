@@ -146,11 +146,11 @@ def test_a_keyframe_in_the_window_receives_its_delayed_relevance() -> None:
     loop = TaskMapper(async_estimator(executor, every=9), mapper)
     first = loop.process(frame_at(0))
     assert first.detection_lag_frames is None
-    assert not mapper.keyframes()[0].relevance.roi.any()
+    assert not mapper.store.kept[0].relevance.roi.any()
     executor.run_next()
     second = loop.process(frame_at(1))
     assert second.detection_lag_frames == 1
-    np.testing.assert_array_equal(mapper.keyframes()[0].relevance.roi, MUG.mask(frame_at(0)))
+    np.testing.assert_array_equal(mapper.store.kept[0].relevance.roi, MUG.mask(frame_at(0)))
     assert mapper.gaussians().kappa.any()
 
 
@@ -165,7 +165,7 @@ def test_a_keyframe_outside_the_window_receives_its_delayed_relevance() -> None:
         loop.process(frame_at(index))
     executor.run_next()
     assert loop.process(frame_at(4)).detection_lag_frames == 4
-    assert mapper.keyframes()[0].relevance.roi.any()
+    assert mapper.store.kept[0].relevance.roi.any()
 
 
 def test_a_detection_on_a_past_frame_continues_when_its_pose_and_pixels_change() -> None:

@@ -48,10 +48,7 @@ def widths_m(*detections: Detection) -> list[tuple[float, float]]:
 
 
 def test_pixels_that_two_nouns_claim_locate_neither_object():
-    cabinet, table = (
-        detection("cabinet", 40, 80),
-        detection("table", 70, 130),
-    )
+    cabinet, table = (detection("cabinet", 40, 80), detection("table", 70, 130))
     (low_m, high_m), (table_low_m, table_high_m) = widths_m(cabinet, table)
     assert (low_m, high_m) == pytest.approx((-0.8, -0.2), abs=0.06)
     assert (table_low_m, table_high_m) == pytest.approx((0.0, 1.0), abs=0.06)

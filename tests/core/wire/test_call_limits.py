@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,14 +18,7 @@ from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, RateLimitError
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.security import (
-    MESSAGE_BYTES,
-    Caller,
-    CallLimits,
-    CallUsage,
-    TokenBucket,
-    wait_for_bandwidth,
-)
+from gausslite.wire.security import MESSAGE_BYTES, Caller, CallLimits, CallUsage, TokenBucket, wait_for_bandwidth
 from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 
@@ -69,11 +63,11 @@ def test_the_open_calls_of_a_caller_are_limited() -> None:
 
 
 def test_callers_that_are_gone_take_no_memory() -> None:
-    usage = CallUsage(CallLimits())
+    usage, buckets = CallUsage(CallLimits()), []
     for number in range(1000):
-        with usage.open_call(Caller(f"10.0.{number // 256}.{number % 256}")):
-            pass
-    assert len(usage._usages) == 1
+        with usage.open_call(Caller(f"10.0.{number // 256}.{number % 256}")) as bandwidth:
+            buckets.append(weakref.ref(bandwidth))
+    assert sum(bucket() is not None for bucket in buckets) == 1
 
 
 def test_requests_above_the_bandwidth_wait() -> None:
@@ -110,8 +104,18 @@ def test_a_certificate_has_its_own_limit_and_the_others_go_on(tmp_path: Path) ->
             watch.close()
 
 
+def fill_until_refused(address: str, count: int) -> list[socket.socket]:
+    """Open connections until the server refuses the newest one."""
+    opened = list(connections(address, count))
+    opened[-1].settimeout(20)
+    with contextlib.suppress(ConnectionError):
+        while opened[-1].recv(4096):
+            pass
+    return opened
+
+
 def test_connections_are_limited() -> None:
-    with serving([parser_service(RuleParser())], limits=CallLimits(connections=5)) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=CallLimits(connections=5)) as server:
         opened = list(connections(server.address, 20))
         assert sum(not is_closed(connection) for connection in opened) <= 5
         for connection in opened:
@@ -121,16 +125,11 @@ def test_connections_are_limited() -> None:
 
 
 def test_idle_connections_do_not_lock_out_who_is_connected_already() -> None:
-    with serving([parser_service(RuleParser())], limits=CallLimits(connections=5)) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=CallLimits(connections=5)) as server:
         with grpc.insecure_channel(server.address) as channel:
             check = health_pb2_grpc.HealthStub(channel).Check
             assert check(health_pb2.HealthCheckRequest(), timeout=20, wait_for_ready=True).status == SERVING
-            opened = list(connections(server.address, 20))
-            # until the server refuses the newest one
-            opened[-1].settimeout(20)
-            with contextlib.suppress(ConnectionError):
-                while opened[-1].recv(4096):
-                    pass
+            opened = fill_until_refused(server.address, 20)
             assert check(health_pb2.HealthCheckRequest(), timeout=20).status == SERVING
         for connection in opened:
             connection.close()
@@ -141,13 +140,8 @@ def test_idle_connections_do_not_lock_out_who_is_connected_already() -> None:
 
 def test_an_own_address_for_health_answers_while_idle_connections_take_the_other() -> None:
     limits = CallLimits(connections=200)
-    with serving([parser_service(RuleParser())], limits=limits, health_listen="127.0.0.1:0") as server:
-        opened = list(connections(server.address, 300))
-        # until the server refuses the newest one
-        opened[-1].settimeout(20)
-        with contextlib.suppress(ConnectionError):
-            while opened[-1].recv(4096):
-                pass
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=limits, health_listen="127.0.0.1:0") as server:
+        opened = fill_until_refused(server.address, 300)
         with grpc.insecure_channel(server.health_address) as channel:
             check = health_pb2_grpc.HealthStub(channel).Check
             for name in ("", "liveness", "gausslite.v1.ParserService"):
@@ -161,7 +155,7 @@ def test_an_own_address_for_health_answers_while_idle_connections_take_the_other
 
 
 def test_a_connection_without_a_call_is_closed() -> None:
-    with serving([parser_service(RuleParser())], limits=CallLimits(idle_s=1)) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0", limits=CallLimits(idle_s=1)) as server:
         (connection,) = connections(server.address, 1)
         connection.settimeout(20)
         received = b""

@@ -55,7 +55,7 @@ def test_no_thread_reads_frames_after_a_failed_stream() -> None:
 @pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
 def test_a_service_of_this_machine_is_reached_without_the_proxy(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
     monkeypatch.setenv(variable, f"http://{NOBODY}")
-    with serving([]) as server:
+    with serving([], "127.0.0.1:0") as server:
         port = server.address.rpartition(":")[2]
         for host in ("127.0.0.1", "localhost"):
             require_serving(f"{host}:{port}", None)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from call_context import Context
 from certificates import identity, make_certificates
-from fusion_running import GRID, fusion_server, make_subset, request
+from fusion_running import GRID, RunningServer, fusion_server, make_subset, request
 from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, NotPermittedError
@@ -94,10 +94,7 @@ def test_a_session_is_of_use_only_to_the_certificate_that_opened_it(certs: Path)
     ):
         session = owner.join("husky-1", GRID).session_id
         message = request(session, make_subset("husky-1", 1, {0: [1]}))
-        for call in (
-            lambda: list(thief.contribute([message], 20.0)),
-            lambda: thief.leave(session, forget=True),
-        ):
+        for call in (lambda: list(thief.contribute([message], 20.0)), lambda: thief.leave(session, forget=True)):
             with pytest.raises(NotPermittedError, match="'husky-1': expected a certificate that names it"):
                 call()
         assert len(list(owner.contribute([message], 20.0))) == 1
@@ -121,7 +118,7 @@ def test_a_parser_serves_every_role_and_no_certificate_without_one(certs: Path) 
             client.parse("Pick up the mug")
 
 
-def test_without_certificates_only_this_machine_evicts() -> None:
+def test_without_certificates_only_this_machine_evicts(fusion: RunningServer) -> None:
     method = "/gausslite.v1.FusionService/EvictAgent"
     for host in ("127.0.0.1", "::1", "unix"):
         require_role(method, Caller(host))
@@ -129,9 +126,8 @@ def test_without_certificates_only_this_machine_evicts() -> None:
         with pytest.raises(NotPermittedError, match="expected a caller on the server's machine"):
             require_role(method, Caller(host))
         require_role("/gausslite.v1.FusionService/JoinSession", Caller(host))
-    with fusion_server() as t:
-        t.client.join("ant", GRID)
-        assert t.client.evict("ant", ban=True) == 0
+    fusion.client.join("ant", GRID)
+    assert fusion.client.evict("ant", ban=True) == 0
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fusion_running import CAMERA, GRID, frame, fusion_server, make_batch
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_batch
 from uplink_running import WAIT_S, uplink
 
 from gausslite.wire.clients import FusionClient
@@ -68,9 +68,9 @@ def test_a_replaced_keyframe_is_deleted_and_a_newer_one_of_the_same_frame_stays_
     restarted.close()
 
 
-def test_keyframes_reach_the_server_within_the_bandwidth_of_the_updates() -> None:
+def test_keyframes_reach_the_server_within_the_bandwidth_of_the_updates(fusion: RunningServer) -> None:
     settings = UplinkSettings(kbps=100_000, interval_s=0.0)
-    with fusion_server() as fusion, uplink(fusion.client.address, settings) as link:
+    with uplink(fusion.client.address, settings) as link:
         link.enqueue(make_batch({1: [5], 2: [7]}))
         for index in (3, 8):
             link.enqueue_keyframe(encoded(index))
@@ -99,14 +99,13 @@ def test_a_server_that_lost_its_keyframes_gets_them_again_and_one_that_has_them_
     assert agent.keyframes == 1
 
 
-def test_the_server_keeps_exactly_the_selected_keyframes(tmp_path: Path) -> None:
+def test_the_server_keeps_exactly_the_selected_keyframes(fusion: RunningServer, tmp_path: Path) -> None:
     path = tmp_path / "x.spool"
-    with fusion_server() as fusion:
-        with uplink(fusion.client.address, spool=path) as link:
-            for index, replaced in ((1, None), (2, None), (3, 1)):
-                link.enqueue_keyframe(encoded(index), replaced)
-                assert link.drain(WAIT_S)
-        spool = Spool(path, "robot", GRID)
-        with FusionClient(fusion.client.address, token=spool.token) as client:
-            assert tuple(client.join("robot", GRID).keyframes) == (2, 3)
-        spool.close()
+    with uplink(fusion.client.address, spool=path) as link:
+        for index, replaced in ((1, None), (2, None), (3, 1)):
+            link.enqueue_keyframe(encoded(index), replaced)
+            assert link.drain(WAIT_S)
+    spool = Spool(path, "robot", GRID)
+    with FusionClient(fusion.client.address, token=spool.token) as client:
+        assert tuple(client.join("robot", GRID).keyframes) == (2, 3)
+    spool.close()

@@ -10,16 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fusion_running import GRID, fusion_server, make_batch
+from fusion_running import GRID, RunningServer, fusion_server, make_batch
 from uplink_running import EAGER, WAIT_S, accepted, expected_kappas, scripted, stored_kappas, uplink
 from waiting import wait_until
 
 from gausslite.cli.main import main
-from gausslite.domain.errors import (
-    InvalidInputError,
-    MismatchError,
-    StorageError,
-)
+from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
@@ -44,11 +40,11 @@ def test_the_latest_update_of_each_voxel_arrives() -> None:
     assert counters.bytes_sent == counters.roi_bytes > 0
 
 
-def test_the_agent_declares_its_frame() -> None:
+def test_the_agent_declares_its_frame(fusion: RunningServer) -> None:
     T_fused_agent = np.eye(4)
     T_fused_agent[:3, 3] = (4.0, -2.0, 0.5)
     options = replace(EAGER, T_fused_agent=T_fused_agent)
-    with fusion_server() as fusion, uplink(fusion.client.address, options) as link:
+    with uplink(fusion.client.address, options) as link:
         link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
         [agent] = fusion.client.status().agents
@@ -56,10 +52,10 @@ def test_the_agent_declares_its_frame() -> None:
 
 
 def test_an_unknown_frame_is_in_the_agents_log_in_the_status_and_beside_the_objects(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    fusion: RunningServer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = replace(EAGER, frame="unknown", check_interval_s=0.1)
-    with fusion_server() as fusion, uplink(fusion.client.address, options) as link:
+    with uplink(fusion.client.address, options) as link:
         link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
         wait_until(lambda: "uplink: frame unknown: not in the team's map yet; this server compares" in caplog.text)
@@ -71,24 +67,22 @@ def test_an_unknown_frame_is_in_the_agents_log_in_the_status_and_beside_the_obje
     assert "note: the objects of robot are left out; frame unknown" in printed
 
 
-def test_an_agent_that_joins_again_with_its_frame_is_used(caplog: pytest.LogCaptureFixture) -> None:
-    with fusion_server() as fusion:
-        for frame in ("unknown", "team"):
-            with uplink(fusion.client.address, replace(EAGER, frame=frame)) as link:
-                link.enqueue(make_batch({1: [5], 2: [3]}))
-                assert link.drain(WAIT_S)
-            assert fusion.client.status().fused_voxels == (0 if frame == "unknown" else 2)
+def test_an_agent_that_joins_again_with_its_frame_is_used(
+    fusion: RunningServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    for frame in ("unknown", "team"):
+        with uplink(fusion.client.address, replace(EAGER, frame=frame)) as link:
+            link.enqueue(make_batch({1: [5], 2: [3]}))
+            assert link.drain(WAIT_S)
+        assert fusion.client.status().fused_voxels == (0 if frame == "unknown" else 2)
 
 
 def test_a_quarantine_is_in_the_agents_log_and_in_the_status(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    fusion: RunningServer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reason = "frame: contradicts ant, bee: 0.61 m and 20 deg would fit better (ant)"
     quarantined = FrameAlignment(0, AlignmentState.QUARANTINED, message=reason, against=("ant", "bee"))
-    with (
-        fusion_server() as fusion,
-        uplink(fusion.client.address, replace(EAGER, check_interval_s=0.1)) as link,
-    ):
+    with uplink(fusion.client.address, replace(EAGER, check_interval_s=0.1)) as link:
         link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
         fusion.servicer.engine.frames.add("robot", quarantined)
@@ -229,16 +223,16 @@ def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
         UplinkSettings(**wrong)  # type: ignore[arg-type]
 
 
-def test_the_latest_report_of_objects_is_sent_also_without_voxels() -> None:
+def test_the_latest_report_of_objects_is_sent_also_without_voxels(fusion: RunningServer) -> None:
     graph = TaskGraph("t", "Find the mug", ("mug",), (), ())
-    with fusion_server() as server, uplink(server.client.address) as link:
+    with uplink(fusion.client.address) as link:
         link.report_objects(ObjectReport(graph))
         assert link.drain(20)
-        [agent] = server.client.status().agents
+        [agent] = fusion.client.status().agents
         assert list(agent.targets) == ["mug"]
         changed = replace(graph, targets=("cup",))
         link.report_objects(ObjectReport(changed))
         link.report_objects(ObjectReport(graph))
         link.report_objects(ObjectReport(changed))
         assert link.drain(20)
-        assert list(server.client.status().agents[0].targets) == ["cup"]
+        assert list(fusion.client.status().agents[0].targets) == ["cup"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from few_examples import few_examples
-from fusion_running import fusion_server, make_batch
+from fusion_running import RunningServer, make_batch
 from hypothesis import given
 from hypothesis import strategies as st
 from serving import serving
@@ -126,8 +126,8 @@ def test_an_error_that_only_the_operator_can_fix_stops_the_uplink(final: GaussLi
     assert len(server.subsets) == 1
 
 
-def test_the_server_refuses_another_grid() -> None:
-    with fusion_server() as fusion, uplink(fusion.client.address, grid=VoxelGrid(0.2)) as link:
+def test_the_server_refuses_another_grid(fusion: RunningServer) -> None:
+    with uplink(fusion.client.address, grid=VoxelGrid(0.2)) as link:
         link.enqueue(make_batch({}))
         empty = np.zeros(1, np.uint64), np.zeros(1, np.uint32), make_batch({}).gaussians
         link.enqueue(VoxelBatch(VoxelGrid(0.2).keys(np.zeros((1, 3), np.float32)), *empty))
@@ -176,8 +176,7 @@ def test_after_any_losses_the_server_has_the_latest_updates(
 ) -> None:
     server = FlakyServer(faults)
     service = Service(
-        "gausslite.v1.FusionService",
-        lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running),
+        "gausslite.v1.FusionService", lambda running: pb_grpc.add_FusionServiceServicer_to_server(server, running)
     )
     with serving([service]) as running, uplink(running.address) as link:
         for voxels in enqueued:

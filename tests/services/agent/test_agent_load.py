@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agent_running import SETTINGS, TASK, Gate, agent, ball_estimator
+from agent_running import SETTINGS, TASK, Agent, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
@@ -172,16 +172,15 @@ def test_waiting_frames_are_dropped_at_shutdown() -> None:
     worker.close()
     assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
     with pytest.raises(UnavailableError, match="shutting down"):
-        worker.run(lambda mapper: mapper.count)
+        worker.run(lambda mapper: mapper.table.count)
 
 
-def test_a_frame_larger_than_a_message_is_made_smaller_and_the_stream_continues() -> None:
+def test_a_frame_larger_than_a_message_is_made_smaller_and_the_stream_continues(robot: Agent) -> None:
     size = (3840, 2880)
     noise = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
     images = {"rgb": noise, "depth_m": np.full(size[::-1], 2.0, np.float32), "camera": CAMERA.resized(*size)}
-    with agent() as a:
-        a.client.assign_task(TASK)
-        outcomes = list(a.client.ingest([frame(0, CAMERA), replace(frame(1, CAMERA), **images), frame(2, CAMERA)]))
+    robot.client.assign_task(TASK)
+    outcomes = list(robot.client.ingest([frame(0, CAMERA), replace(frame(1, CAMERA), **images), frame(2, CAMERA)]))
     assert [each.outcome for each in outcomes] == [pb.FRAME_OUTCOME_MAPPED] * 3, [each.reason for each in outcomes]
 
 
@@ -223,12 +222,11 @@ def test_after_a_full_spool_all_changes_are_published_again(tmp_path: Path) -> N
     assert int(store.batches()["robot"].counts.sum()) == len(active) > 0
 
 
-def test_an_error_of_the_callers_frames_is_raised_as_it_is() -> None:
+def test_an_error_of_the_callers_frames_is_raised_as_it_is(robot: Agent) -> None:
     def frames() -> Iterator[Frame]:
         yield frame(0)
         raise OSError("the camera was unplugged")
 
-    with agent() as a:
-        a.client.assign_task(TASK)
-        with pytest.raises(OSError, match="unplugged"):
-            list(a.client.ingest(frames()))
+    robot.client.assign_task(TASK)
+    with pytest.raises(OSError, match="unplugged"):
+        list(robot.client.ingest(frames()))

@@ -16,7 +16,7 @@ from pathlib import Path
 import grpc
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, frame, fusion_server
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server
 from plugin_entries import register
 from signals import hangup
 from tiny_yolo import write_tiny_yolo
@@ -146,12 +146,12 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
     assert agent.gaussians == written.active.sum()
 
 
-def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
+def test_handover_brings_the_whole_map_and_the_keyframes(fusion: RunningServer, tmp_path: Path) -> None:
     options = settings(tmp_path, "--set", "handover=true", "--fusion", "localhost:1")
-    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
+    with agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
-        keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
+        keyframes = worker.run(lambda mapper: mapper.store.kept).result(20)
         stored = stored_keyframe_from_message(fusion.client.keyframe(agent.agent_id))
     assert stored is not None
     assert stored.roi is not None
@@ -188,20 +188,20 @@ def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
 
 
 def test_without_a_plug_in_that_selects_keyframes_none_are_sent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fusion: RunningServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     register(monkeypatch, Group.KEYFRAME_UPLOADS)
     options = settings(tmp_path, "--set", "handover=true", "--fusion", "localhost:1")
-    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
+    with agent_mission(options, fusion.client.address) as (mission, _):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
     assert agent.handover_bytes > 0
     assert agent.keyframes == 0
 
 
-def test_a_request_ends_a_replay_with_its_handover(tmp_path: Path) -> None:
+def test_a_request_ends_a_replay_with_its_handover(fusion: RunningServer, tmp_path: Path) -> None:
     options, wall = settings(tmp_path), Wall(10_000)
-    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
+    with agent_mission(options, fusion.client.address) as (mission, _):
         thread = threading.Thread(target=mission.run, args=(stream_of(wall, options),))
         thread.start()
         assert wall.reached.wait(20)
@@ -337,9 +337,11 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.L
     assert "frame 3 skipped: wall/frame-3.png" in caplog.text
 
 
-def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(tmp_path: Path) -> None:
+def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(
+    fusion: RunningServer, tmp_path: Path
+) -> None:
     options = settings(tmp_path, "--set", "strict=true")
-    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
+    with agent_mission(options, fusion.client.address) as (mission, _):
         with pytest.raises(DatasetError, match="frame-3"):
             mission.run(stream_of(Wall(broken_at=3), options))
         [agent] = fusion.client.status().agents

@@ -49,12 +49,11 @@ from gausslite_language.rules import RuleParser
 from gausslite_view.decoding import camera_view_from_message
 
 
-def test_a_task_is_text_or_a_graph() -> None:
-    with agent() as a:
-        graph = a.client.assign_task(TASK)
-        assert graph == RuleParser().parse(TASK)
-        assert a.client.assign_task(graph) == graph
-        assert convert_task.graph_from_message(a.client.status().graph) == graph
+def test_a_task_is_text_or_a_graph(robot: Agent) -> None:
+    graph = robot.client.assign_task(TASK)
+    assert graph == RuleParser().parse(TASK)
+    assert robot.client.assign_task(graph) == graph
+    assert convert_task.graph_from_message(robot.client.status().graph) == graph
 
 
 def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
@@ -148,15 +147,14 @@ def test_a_refused_task_is_not_logged_as_an_error_that_nobody_has_looked_at() ->
     assert unseen == []
 
 
-def test_an_invalid_task_is_refused() -> None:
-    with agent() as a:
-        with pytest.raises(TaskError):
-            a.client.assign_task(" ")
-        with pytest.raises(TaskError, match="targets"):
-            a.client.assign_task(TaskGraph("", "", (), (), ()))
-        with pytest.raises(grpc.RpcError) as caught:
-            a.stub.AssignTask(pb.AssignTaskRequest())
-        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
+def test_an_invalid_task_is_refused(robot: Agent) -> None:
+    with pytest.raises(TaskError):
+        robot.client.assign_task(" ")
+    with pytest.raises(TaskError, match="targets"):
+        robot.client.assign_task(TaskGraph("", "", (), (), ()))
+    with pytest.raises(grpc.RpcError) as caught:
+        robot.stub.AssignTask(pb.AssignTaskRequest())
+    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
 
 
 def test_assign_task_raises_the_error_of_the_estimator() -> None:
@@ -167,9 +165,9 @@ def test_assign_task_raises_the_error_of_the_estimator() -> None:
         a.client.assign_task(TASK)
 
 
-def test_frames_need_a_task_first() -> None:
-    with agent() as a, pytest.raises(MismatchError, match="AssignTask"):
-        list(a.client.ingest([frame(0)]))
+def test_frames_need_a_task_first(robot: Agent) -> None:
+    with pytest.raises(MismatchError, match="AssignTask"):
+        list(robot.client.ingest([frame(0)]))
 
 
 def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() -> None:
@@ -206,16 +204,15 @@ def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() 
     assert refused.details() == "task: superseded by a newer AssignTask before it was assigned"
 
 
-def test_each_frame_has_its_outcome_in_order() -> None:
+def test_each_frame_has_its_outcome_in_order(robot: Agent) -> None:
     dark = Frame(1, 1, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32), CAMERA, np.eye(4))
     requests = [
         pb.IngestFramesRequest(frame=convert.frame_to_message(each)) for each in (frame(0), dark, frame(2), frame(3))
     ]
     requests[2].frame.t_world_camera.row_major[0] = float("nan")
-    with agent() as a:
-        a.client.assign_task(TASK)
-        answers = list(a.stub.IngestFrames(iter(requests)))
-        status = a.client.status()
+    robot.client.assign_task(TASK)
+    answers = list(robot.stub.IngestFrames(iter(requests)))
+    status = robot.client.status()
     assert [answer.index for answer in answers] == [0, 1, 2, 3]
     assert [answer.outcome for answer in answers] == [
         pb.FRAME_OUTCOME_MAPPED, pb.FRAME_OUTCOME_SKIPPED, pb.FRAME_OUTCOME_REJECTED, pb.FRAME_OUTCOME_MAPPED,
@@ -232,36 +229,34 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert status.hz > 0
 
 
-def test_a_frame_that_is_not_later_is_refused_unless_the_clock_has_jumped() -> None:
+def test_a_frame_that_is_not_later_is_refused_unless_the_clock_has_jumped(robot: Agent) -> None:
     def outcomes(*times_ms: int) -> str:
         frames = (replace(frame(0), capture_time_ns=time_ms * 1_000_000) for time_ms in times_ms)
-        answers = list(a.client.ingest(frames))
+        answers = list(robot.client.ingest(frames))
         reasons.extend(answer.reason for answer in answers if answer.reason)
         return "".join("m" if answer.outcome == pb.FRAME_OUTCOME_MAPPED else "r" for answer in answers)
 
     reasons: list[str] = []
-    with agent() as a:
-        a.client.assign_task(TASK)
-        # also on another stream; equal times are no order either
-        assert outcomes(9000, 9000, 8990, 9001) == "mrrm"
-        assert outcomes(9001, 9002) == "rm"
-        # far back, and several ascending times in a row: a clock that was set
-        assert outcomes(7000, 6999, 7001) == "mrm"
-        assert outcomes(6980, 6985, 6990, 6991, 6995, 6996) == "rrrrmm"
-        a.client.end_mission()
-        a.client.assign_task("Find the chair")
-        assert outcomes(6990) == "m"
+    robot.client.assign_task(TASK)
+    # also on another stream; equal times are no order either
+    assert outcomes(9000, 9000, 8990, 9001) == "mrrm"
+    assert outcomes(9001, 9002) == "rm"
+    # far back, and several ascending times in a row: a clock that was set
+    assert outcomes(7000, 6999, 7001) == "mrm"
+    assert outcomes(6980, 6985, 6990, 6991, 6995, 6996) == "rrrrmm"
+    robot.client.end_mission()
+    robot.client.assign_task("Find the chair")
+    assert outcomes(6990) == "m"
     assert reasons[0] == (
         "frame capture_time_ns: expected more than 9000000000, that of the frame before, got 9000000000"
     )
 
 
-def test_the_status_has_the_odometrys_correction() -> None:
-    with agent() as a:
-        a.client.assign_task(TASK)
-        assert not a.client.status().HasField("map_to_odom")
-        list(a.client.ingest(frame(index) for index in range(2)))
-        correction = a.client.status().map_to_odom
+def test_the_status_has_the_odometrys_correction(robot: Agent) -> None:
+    robot.client.assign_task(TASK)
+    assert not robot.client.status().HasField("map_to_odom")
+    list(robot.client.ingest(frame(index) for index in range(2)))
+    correction = robot.client.status().map_to_odom
     # poses are exact by default
     np.testing.assert_allclose(convert.transform_from_message("t", correction.t_map_odometry), np.eye(4), atol=1e-12)
     assert correction.capture_time_ns == frame(1).capture_time_ns
@@ -318,14 +313,13 @@ def test_an_unexpected_error_ends_its_stream_and_not_the_agent() -> None:
         assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
 
 
-def test_render_view_shows_the_map() -> None:
-    with agent() as a:
-        rgb, depth_m = a.client.render(CAMERA, np.eye(4))
-        assert not rgb.any()
-        assert not depth_m.any()
-        a.client.assign_task(TASK)
-        list(a.client.ingest([frame(index) for index in range(3)]))
-        rgb, depth_m = a.client.render(CAMERA, np.eye(4))
+def test_render_view_shows_the_map(robot: Agent) -> None:
+    rgb, depth_m = robot.client.render(CAMERA, np.eye(4))
+    assert not rgb.any()
+    assert not depth_m.any()
+    robot.client.assign_task(TASK)
+    list(robot.client.ingest([frame(index) for index in range(3)]))
+    rgb, depth_m = robot.client.render(CAMERA, np.eye(4))
     assert rgb.shape == (24, 32, 3)
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(1.2, abs=0.1)
 
@@ -351,12 +345,11 @@ def test_views_wait_for_frames_and_are_refused_by_name_without_time_for_them() -
             a.client.render(replace(CAMERA, width_px=3000, height_px=2000), np.eye(4))
 
 
-def test_the_camera_view_shows_the_newest_keyframe_and_the_path() -> None:
-    with agent() as a:
-        assert camera_view_from_message(a.client.camera_view()) is None
-        a.client.assign_task(TASK)
-        list(a.client.ingest([frame(index) for index in range(3)]))
-        view = camera_view_from_message(a.client.camera_view())
+def test_the_camera_view_shows_the_newest_keyframe_and_the_path(robot: Agent) -> None:
+    assert camera_view_from_message(robot.client.camera_view()) is None
+    robot.client.assign_task(TASK)
+    list(robot.client.ingest([frame(index) for index in range(3)]))
+    view = camera_view_from_message(robot.client.camera_view())
     assert view is not None
     assert view.camera == CAMERA
     assert np.abs(view.rgb.astype(int) - frame(view.frame_index).rgb).mean() < 5
@@ -370,15 +363,14 @@ def test_the_camera_view_shows_the_newest_keyframe_and_the_path() -> None:
     ("camera", "T_world_camera"),
     [(Camera(1e4, 1e4, 1.0, 1.0, 16384, 16384), np.eye(4)), (CAMERA, np.full((4, 4), np.nan)), (CAMERA, np.eye(3))],
 )
-def test_an_invalid_camera_or_pose_is_refused(camera: Camera, T_world_camera: np.ndarray) -> None:
+def test_an_invalid_camera_or_pose_is_refused(robot: Agent, camera: Camera, T_world_camera: np.ndarray) -> None:
     request = pb.RenderViewRequest(
         camera=convert.camera_to_message(camera), t_world_camera={"row_major": T_world_camera.reshape(-1).tolist()}
     )
-    with agent() as a:
-        with pytest.raises(grpc.RpcError) as caught:
-            a.stub.RenderView(request)
-        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
-        assert a.client.status().agent_id == "robot"
+    with pytest.raises(grpc.RpcError) as caught:
+        robot.stub.RenderView(request)
+    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
+    assert robot.client.status().agent_id == "robot"
 
 
 def follow(updates: Iterator[convert.MapUpdate], table: dict[int, int]) -> int:
@@ -401,27 +393,28 @@ def counts_now(worker: MappingWorker) -> dict[int, int]:
     return dict(zip(*(part.tolist() for part in np.unique(keys, return_counts=True)), strict=True))
 
 
-def test_a_watcher_follows_the_map() -> None:
-    with agent() as a:
-        a.client.assign_task(TASK)
-        updates = a.client.watch_map()
-        seen: dict[int, int] = {}
-        revision = follow(updates, seen)
-        assert seen == {}
-        for index in range(3):
-            list(a.client.ingest([frame(index)]))
-            before, revision = revision, follow(updates, seen)
-            assert revision > before
-            assert seen == counts_now(a.worker)
-        updates.close()
-        list(a.client.ingest([frame(3)]))
-        resumed = a.client.watch_map(since_revision=revision)
-        follow(resumed, seen)
-        resumed.close()
-        assert seen == counts_now(a.worker)
+def test_a_watcher_follows_the_map(robot: Agent) -> None:
+    robot.client.assign_task(TASK)
+    updates = robot.client.watch_map()
+    seen: dict[int, int] = {}
+    revision = follow(updates, seen)
+    assert seen == {}
+    for index in range(3):
+        list(robot.client.ingest([frame(index)]))
+        before, revision = revision, follow(updates, seen)
+        assert revision > before
+        assert seen == counts_now(robot.worker)
+    updates.close()
+    list(robot.client.ingest([frame(3)]))
+    resumed = robot.client.watch_map(since_revision=revision)
+    follow(resumed, seen)
+    resumed.close()
+    assert seen == counts_now(robot.worker)
 
 
-def test_frames_are_mapped_while_the_map_is_compared_for_a_watcher(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_mapped_while_the_map_is_compared_for_a_watcher(
+    robot: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
     update, begun, continued = MapChangeLog.update, threading.Event(), threading.Event()
 
     def slow_update(*arguments: object) -> None:
@@ -430,33 +423,31 @@ def test_frames_are_mapped_while_the_map_is_compared_for_a_watcher(monkeypatch: 
         update(*arguments)
 
     monkeypatch.setattr(MapChangeLog, "update", slow_update)
-    with agent() as a:
-        a.client.assign_task(TASK)
-        list(a.client.ingest([frame(0)]))
-        watching = a.stub.WatchMap(pb.WatchMapRequest())
-        try:
-            assert begun.wait(20)
-            request = pb.IngestFramesRequest(frame=convert.frame_to_message(frame(1)))
-            [answer] = a.stub.IngestFrames(iter([request]), timeout=20)
-            assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
-        finally:
-            continued.set()
-        assert len(next(watching).block.subset) > 0
-        watching.cancel()
+    robot.client.assign_task(TASK)
+    list(robot.client.ingest([frame(0)]))
+    watching = robot.stub.WatchMap(pb.WatchMapRequest())
+    try:
+        assert begun.wait(20)
+        request = pb.IngestFramesRequest(frame=convert.frame_to_message(frame(1)))
+        [answer] = robot.stub.IngestFrames(iter([request]), timeout=20)
+        assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
+    finally:
+        continued.set()
+    assert len(next(watching).block.subset) > 0
+    watching.cancel()
 
 
-def test_a_watcher_may_select_a_box_or_the_tasks_region() -> None:
-    with agent() as a:
-        a.client.assign_task(TASK)
-        list(a.client.ingest([frame(0)]))
-        shown: list[dict[int, int]] = []
-        box = AxisAlignedBox((-0.1, -0.1, 0.0), (0.1, 0.1, 5.0))
-        for region, roi_only in ((None, False), (box, False), (None, True)):
-            updates = a.client.watch_map(region=region, roi_only=roi_only)
-            shown.append({})
-            follow(updates, shown[-1])
-            updates.close()
-        gaussians = a.worker.run(lambda mapper: mapper.gaussians()).result(20)
+def test_a_watcher_may_select_a_box_or_the_tasks_region(robot: Agent) -> None:
+    robot.client.assign_task(TASK)
+    list(robot.client.ingest([frame(0)]))
+    shown: list[dict[int, int]] = []
+    box = AxisAlignedBox((-0.1, -0.1, 0.0), (0.1, 0.1, 5.0))
+    for region, roi_only in ((None, False), (box, False), (None, True)):
+        updates = robot.client.watch_map(region=region, roi_only=roi_only)
+        shown.append({})
+        follow(updates, shown[-1])
+        updates.close()
+    gaussians = robot.worker.run(lambda mapper: mapper.gaussians()).result(20)
     everything, in_box, of_task = shown
     assert 0 < len(in_box) < len(everything)
     assert in_box.items() <= everything.items()
@@ -464,15 +455,15 @@ def test_a_watcher_may_select_a_box_or_the_tasks_region() -> None:
 
 
 @pytest.mark.parametrize("since", [1, 2**62])
-def test_a_revision_that_is_not_kept_is_out_of_range(since: int) -> None:
-    with agent() as a, pytest.raises(RevisionGoneError, match="since_revision"):
-        next(iter(a.client.watch_map(since_revision=since)))
+def test_a_revision_that_is_not_kept_is_out_of_range(robot: Agent, since: int) -> None:
+    with pytest.raises(RevisionGoneError, match="since_revision"):
+        next(iter(robot.client.watch_map(since_revision=since)))
 
 
-def test_an_upside_down_region_is_refused() -> None:
+def test_an_upside_down_region_is_refused(robot: Agent) -> None:
     request = pb.WatchMapRequest(region={"min_m": {"x": 1.0}, "max_m": {"x": -1.0}})
-    with agent() as a, pytest.raises(grpc.RpcError) as caught:
-        next(a.stub.WatchMap(request))
+    with pytest.raises(grpc.RpcError) as caught:
+        next(robot.stub.WatchMap(request))
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
     with pytest.raises(InvalidInputError, match="box"):
         AxisAlignedBox((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))

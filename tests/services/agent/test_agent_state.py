@@ -107,20 +107,19 @@ class SeeingEstimator(RegionRelevanceEstimator):
         self.seen = state["seen"].copy()
 
 
-def test_a_restarted_agent_keeps_its_objects_on_the_server(tmp_path: Path) -> None:
+def test_a_restarted_agent_keeps_its_objects_on_the_server(fusion: RunningServer, tmp_path: Path) -> None:
     options, spool = settings(tmp_path / "robot.state"), tmp_path / "robot.spool"
-    with fusion_server() as fusion:
-        with agent_run(options, fusion, spool, SeeingEstimator) as (mission, worker):
-            map_frames(worker, 0, 1)
-            mission.finish()
+    with agent_run(options, fusion, spool, SeeingEstimator) as (mission, worker):
+        map_frames(worker, 0, 1)
+        mission.finish()
+    assert [found.landmark.noun for found in fusion.client.query_objects()] == ["mug"]
+    with (
+        patch.object(Uplink, "report_objects", autospec=True, side_effect=Uplink.report_objects) as reporting,
+        agent_run(options, fusion, spool, SeeingEstimator) as (mission, worker),
+    ):
+        assert worker.uplink is not None
+        assert worker.uplink.drain(20.0)
         assert [found.landmark.noun for found in fusion.client.query_objects()] == ["mug"]
-        with (
-            patch.object(Uplink, "report_objects", autospec=True, side_effect=Uplink.report_objects) as reporting,
-            agent_run(options, fusion, spool, SeeingEstimator) as (mission, worker),
-        ):
-            assert worker.uplink is not None
-            assert worker.uplink.drain(20.0)
-            assert [found.landmark.noun for found in fusion.client.query_objects()] == ["mug"]
     reports = [call.args[1] for call in reporting.call_args_list]
     assert reports
     assert all(report.objects for report in reports)

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from agent_running import TASK, agent
+from agent_running import TASK, Agent, agent
 from browser import open_browser, point
 from fusion_running import frame
 
@@ -43,14 +43,14 @@ def assign(tab: Any, task: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
-    with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
+def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it(robot: Agent):
+    with open_browser() as browser, live_page(0, robot.client.address, is_agent=True) as url:
         tab = browser.new_page()
         tab.goto(url)
         assign(tab, TASK)
         tab.get_by_text("assigned: targets mug").wait_for()
-        assert running.client.status().graph.text == TASK
-        report = next(running.client.ingest([frame(0)]))
+        assert robot.client.status().graph.text == TASK
+        report = next(robot.client.ingest([frame(0)]))
         assert report.gaussians > 0
         tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
         tab.get_by_text("robot: mapping").wait_for()
@@ -87,30 +87,29 @@ def test_the_newest_detection_is_drawn_over_its_image_in_a_browser():
 
 
 @pytest.mark.slow
-def test_a_wrong_task_is_reported_on_the_page():
-    with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
+def test_a_wrong_task_is_reported_on_the_page(robot: Agent):
+    with open_browser() as browser, live_page(0, robot.client.address, is_agent=True) as url:
         tab = browser.new_page()
         tab.goto(url)
         assign(tab, "<b>")
         tab.get_by_text("'<b>'").wait_for()
-        assert not running.client.status().graph.text
+        assert not robot.client.status().graph.text
 
 
-def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe():
-    with agent() as running:
-        page, client = SeenPage(), AgentClient(running.client.address)
-        panel = AgentPanel(page, client)
-        try:
-            running.client.assign_task(TASK)
-            for index in range(3):
-                next(running.client.ingest([frame(index)]))
-            poll_until(panel.poll, lambda: len(page.contents.gaussians) > 0)
-            rendered, _ = client.render(frame(0).camera, frame(0).T_world_camera)
-            full_db = plot(page, "training PSNR, full image (dB)")["dB"][0]
-            assert full_db == pytest.approx(psnr(rendered, camera_view_from_message(client.camera_view()).rgb), abs=1.0)
-        finally:
-            panel.close()
-            page.close()
+def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe(robot: Agent):
+    page, client = SeenPage(), AgentClient(robot.client.address)
+    panel = AgentPanel(page, client)
+    try:
+        robot.client.assign_task(TASK)
+        for index in range(3):
+            next(robot.client.ingest([frame(index)]))
+        poll_until(panel.poll, lambda: len(page.contents.gaussians) > 0)
+        rendered, _ = client.render(frame(0).camera, frame(0).T_world_camera)
+        full_db = plot(page, "training PSNR, full image (dB)")["dB"][0]
+        assert full_db == pytest.approx(psnr(rendered, camera_view_from_message(client.camera_view()).rgb), abs=1.0)
+    finally:
+        panel.close()
+        page.close()
 
 
 @pytest.mark.slow

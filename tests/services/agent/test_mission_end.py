@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from agent_running import TASK, agent
-from fusion_running import GRID, frame, fusion_server, red_frame
+from fusion_running import GRID, RunningServer, frame, red_frame
 from tiny_yolo import write_tiny_yolo
 from waiting import wait_until
 
@@ -41,8 +41,8 @@ def state_name(client: AgentClient) -> str:
     return pb.AgentState.Name(client.status().state).removeprefix("AGENT_STATE_")
 
 
-def test_end_mission_drains_and_a_task_begins_the_next_mission() -> None:
-    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+def test_end_mission_drains_and_a_task_begins_the_next_mission(fusion: RunningServer) -> None:
+    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         assert state_name(a.client) == "WAITING_FOR_TASK"
         with pytest.raises(MismatchError, match="call AssignTask"):
             a.client.end_mission()
@@ -65,13 +65,13 @@ def test_end_mission_drains_and_a_task_begins_the_next_mission() -> None:
     assert again.frames_mapped == 7
 
 
-def test_a_handover_on_request_brings_the_whole_map_and_the_keyframes() -> None:
-    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+def test_a_handover_on_request_brings_the_whole_map_and_the_keyframes(fusion: RunningServer) -> None:
+    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(index) for index in range(6)]))
         response = a.client.end_mission(handover=True)
         [stored] = fusion.client.status().agents
-        kept = a.worker.run(lambda mapper: mapper.keyframes()).result(20)
+        kept = a.worker.run(lambda mapper: mapper.store.kept).result(20)
     assert stored.gaussians == response.gaussians
     assert stored.handover_bytes > 0
     assert stored.keyframes == len(kept) > 0
@@ -93,9 +93,9 @@ def test_an_impossible_drain_time_is_refused(drain_s: float) -> None:
         EndRequest(False, drain_s)
 
 
-def test_two_callers_get_the_result_of_one_end() -> None:
+def test_two_callers_get_the_result_of_one_end(fusion: RunningServer) -> None:
     answers: list[pb.EndMissionResponse] = []
-    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))
         threads = [threading.Thread(target=lambda: answers.append(a.client.end_mission())) for _ in range(2)]
@@ -107,10 +107,12 @@ def test_two_callers_get_the_result_of_one_end() -> None:
     assert answers[0] == answers[1]
 
 
-def test_calls_that_wait_for_the_end_leave_threads_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calls_that_wait_for_the_end_leave_threads_to_others(
+    fusion: RunningServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drained = threading.Event()
     monkeypatch.setattr(Uplink, "drain", lambda *_: drained.wait(60))
-    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+    with linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(0)]))
         # more than asyncio's own threads
@@ -163,24 +165,16 @@ def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subpr
 
 
 @pytest.mark.slow
-def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
-    options = (
-        "--set",
-        "handover=true",
-        "--set",
-        "grace-period=60",
-        "--out",
-        str(tmp_path),
-    )
-    with fusion_server() as fusion:
-        with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
-            client.assign_task("Pick up the cup")
-            list(client.ingest([red_frame(index) for index in range(12)]))
-            process.send_signal(signal.SIGTERM)
-            assert process.stderr is not None
-            log = process.stderr.read()
-            assert process.wait(60) == 0
-        [stored] = fusion.client.status().agents
+def test_sigterm_hands_over_within_the_grace_period(fusion: RunningServer, tmp_path: Path) -> None:
+    options = ("--set", "handover=true", "--set", "grace-period=60", "--out", str(tmp_path))
+    with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
+        client.assign_task("Pick up the cup")
+        list(client.ingest([red_frame(index) for index in range(12)]))
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr is not None
+        log = process.stderr.read()
+        assert process.wait(60) == 0
+    [stored] = fusion.client.status().agents
     assert "mission ended early (interrupted): 12 frames" in log
     assert "nothing was left" in log
     assert stored.gaussians == len(read_ply(tmp_path / "map.ply")) > 0
@@ -189,7 +183,7 @@ def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> None:
+def test_what_sigterm_leaves_is_sent_after_the_next_start(fusion: RunningServer, tmp_path: Path) -> None:
     options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(tmp_path / "x.state"), "--set", "handover=true")
     with agent_process(tmp_path, "127.0.0.1:1", *options, "--set", "grace-period=0.1") as (process, client):
         client.assign_task("Pick up the cup")
@@ -200,10 +194,9 @@ def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> Non
         assert process.wait(60) == 0
     assert "and 6 keyframes, in " in log
     assert "until the agent runs again" in log
-    with fusion_server() as fusion:
-        with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
-            ended = client.end_mission()
-        [stored] = fusion.client.status().agents
+    with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
+        ended = client.end_mission()
+    [stored] = fusion.client.status().agents
     assert (ended.voxels_waiting, ended.keyframes_waiting) == (0, 0)
     assert stored.keyframes == 6
     assert stored.gaussians == ended.gaussians
@@ -223,29 +216,28 @@ def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:
+def test_a_killed_agent_continues_from_its_last_save(fusion: RunningServer, tmp_path: Path) -> None:
     state = tmp_path / "x.state"
     options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(state), "--set", "save-interval=0.05")
-    with fusion_server() as fusion:
-        with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
-            client.assign_task("Pick up the cup")
-            # the first save may be one before the first frame; a different one is of a map
-            saves_ns: set[int] = set()
-            for index in range(1000):
-                list(client.ingest([red_frame(index)]))
-                if state.exists():
-                    saves_ns.add(state.stat().st_mtime_ns)
-                if len(saves_ns) > 1:
-                    break
-            mapped = client.status().map_revision
-            process.kill()
-        with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
-            status = client.status()
-            assert status.graph.text == "Pick up the cup"
-            assert state_name(client) == "MAPPING"
-            assert status.gaussians > 0
-            assert status.map_revision > mapped
-            [answer] = client.ingest([red_frame(2000)])
+    with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
+        client.assign_task("Pick up the cup")
+        # the first save may be one before the first frame; a different one is of a map
+        saves_ns: set[int] = set()
+        for index in range(1000):
+            list(client.ingest([red_frame(index)]))
+            if state.exists():
+                saves_ns.add(state.stat().st_mtime_ns)
+            if len(saves_ns) > 1:
+                break
+        mapped = client.status().map_revision
+        process.kill()
+    with agent_process(tmp_path, fusion.client.address, *options) as (_, client):
+        status = client.status()
+        assert status.graph.text == "Pick up the cup"
+        assert state_name(client) == "MAPPING"
+        assert status.gaussians > 0
+        assert status.map_revision > mapped
+        [answer] = client.ingest([red_frame(2000)])
     assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
 
 

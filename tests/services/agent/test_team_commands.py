@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from agent_running import TASK, agent
-from fusion_running import GRID, frame, fusion_server
+from agent_running import TASK, Agent, agent
+from fusion_running import GRID, RunningServer, frame, fusion_server
 
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply
@@ -66,23 +66,24 @@ def test_the_status_of_an_agent_that_has_not_found_its_task_exits_with_3() -> No
         assert main(["status", robot]) == 3
 
 
-def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with fusion_server() as fusion, agent() as a:
-        for arguments, expected in (
-            (["end", a.client.address], "call AssignTask"),
-            (["status", "nowhere.invalid:1"], "nowhere.invalid:1: "),
-            (["status", "nowhere"], "address: expected HOST:PORT or unix:PATH, got 'nowhere'"),
-            (["status", ""], "address: expected HOST:PORT or unix:PATH, got ''"),
-            (["end", "nowhere"], "gausslite: address of the agent: expected HOST:PORT or unix:PATH, got 'nowhere'"),
-            (["fetch", "http://host:1", "--out", str(tmp_path / "x.ply")], "expected HOST:PORT without http://, got"),
-            (["objects", str(tmp_path / "none")], "output folder of a run: expected HOST:PORT"),
-            (["end", fusion.client.address], "another service listens there"),
-            (["fetch", a.client.address, "--out", str(tmp_path / "x.ply")], "another service listens there"),
-            (["fetch", fusion.client.address, "--out", str(tmp_path / "x.ply")], "the map is empty: the server has no"),
-            (["fetch", fusion.client.address, "--strategy", "refined", "--out", str(tmp_path / "x.ply")], "refine"),
-            (["refine", fusion.client.address, "--out", "/dev/null/x"], "/dev/null"),
-        ):
-            assert main(arguments) == 2
-            [line] = capsys.readouterr().err.splitlines()[-1:]
-            assert expected in line
+def test_errors_are_one_line(
+    fusion: RunningServer, robot: Agent, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, expected in (
+        (["end", robot.client.address], "call AssignTask"),
+        (["status", "nowhere.invalid:1"], "nowhere.invalid:1: "),
+        (["status", "nowhere"], "address: expected HOST:PORT or unix:PATH, got 'nowhere'"),
+        (["status", ""], "address: expected HOST:PORT or unix:PATH, got ''"),
+        (["end", "nowhere"], "gausslite: address of the agent: expected HOST:PORT or unix:PATH, got 'nowhere'"),
+        (["fetch", "http://host:1", "--out", str(tmp_path / "x.ply")], "expected HOST:PORT without http://, got"),
+        (["objects", str(tmp_path / "none")], "output folder of a run: expected HOST:PORT"),
+        (["end", fusion.client.address], "another service listens there"),
+        (["fetch", robot.client.address, "--out", str(tmp_path / "x.ply")], "another service listens there"),
+        (["fetch", fusion.client.address, "--out", str(tmp_path / "x.ply")], "the map is empty: the server has no"),
+        (["fetch", fusion.client.address, "--strategy", "refined", "--out", str(tmp_path / "x.ply")], "refine"),
+        (["refine", fusion.client.address, "--out", "/dev/null/x"], "/dev/null"),
+    ):
+        assert main(arguments) == 2
+        [line] = capsys.readouterr().err.splitlines()[-1:]
+        assert expected in line
     assert not (tmp_path / "x.ply").exists()

@@ -10,12 +10,7 @@ from plugin_entries import register
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import (
-    InvalidInputError,
-    MismatchError,
-    MissingPluginError,
-    QuotaError,
-)
+from gausslite.domain.errors import InvalidInputError, MismatchError, MissingPluginError, QuotaError
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.plugins import Group
@@ -51,22 +46,21 @@ def contributed(t: RunningServer) -> str:
     return session
 
 
-def test_refinement_reports_progress_and_its_map_shows_newer_votes() -> None:
-    with fusion_server() as t:
-        with pytest.raises(MismatchError, match="refined map"):
-            t.client.export(Export("refined"))
-        session = contributed(t)
-        progress = list(t.client.refine(iterations=4))
-        assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
-        assert progress[-1].iteration == progress[-1].iterations == 4
-        assert progress[-1].left_out == ["bee: 1 of 1 keyframes"]
-        assert t.client.status().refined
-        refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
-        assert refined.rgb.tobytes() != voted.rgb.tobytes()
-        t.contribute_subsets(session, make_subset("ant", 2, {0: [90]}))
-        assert sorted(gaussians_from_ply(t.client.export(Export("refined"))).kappa.tolist())[-1] == 90
-        with pytest.raises(InvalidInputError, match="expected none with REFINED"):
-            t.client.export(Export("refined", "ant"))
+def test_refinement_reports_progress_and_its_map_shows_newer_votes(fusion: RunningServer) -> None:
+    with pytest.raises(MismatchError, match="refined map"):
+        fusion.client.export(Export("refined"))
+    session = contributed(fusion)
+    progress = list(fusion.client.refine(iterations=4))
+    assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
+    assert progress[-1].iteration == progress[-1].iterations == 4
+    assert progress[-1].left_out == ["bee: 1 of 1 keyframes"]
+    assert fusion.client.status().refined
+    refined, voted = (gaussians_from_ply(fusion.client.export(Export(name))) for name in ("refined", "vote"))
+    assert refined.rgb.tobytes() != voted.rgb.tobytes()
+    fusion.contribute_subsets(session, make_subset("ant", 2, {0: [90]}))
+    assert sorted(gaussians_from_ply(fusion.client.export(Export("refined"))).kappa.tolist())[-1] == 90
+    with pytest.raises(InvalidInputError, match="expected none with REFINED"):
+        fusion.client.export(Export("refined", "ant"))
 
 
 def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
@@ -87,18 +81,17 @@ def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:
             list(t.client.refine(iterations=2_000_000_000))
 
 
-def test_a_refinement_without_useful_keyframes_is_refused() -> None:
-    with fusion_server() as t:
-        with pytest.raises(MismatchError, match="0 Gaussians and 0 keyframes"):
-            list(t.client.refine())
-        session = t.client.join("ant", GRID).session_id
-        t.contribute_subsets(session, make_subset("ant", 1, {0: [1]}))
-        with pytest.raises(MismatchError, match="1 Gaussians and 0 keyframes"):
-            list(t.client.refine())
-        behind = np.diag([1.0, -1.0, -1.0, 1.0])
-        t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
-        with pytest.raises(InvalidInputError, match="got 1: 0 show it"):
-            list(t.client.refine())
+def test_a_refinement_without_useful_keyframes_is_refused(fusion: RunningServer) -> None:
+    with pytest.raises(MismatchError, match="0 Gaussians and 0 keyframes"):
+        list(fusion.client.refine())
+    session = fusion.client.join("ant", GRID).session_id
+    fusion.contribute_subsets(session, make_subset("ant", 1, {0: [1]}))
+    with pytest.raises(MismatchError, match="1 Gaussians and 0 keyframes"):
+        list(fusion.client.refine())
+    behind = np.diag([1.0, -1.0, -1.0, 1.0])
+    fusion.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
+    with pytest.raises(InvalidInputError, match="got 1: 0 show it"):
+        list(fusion.client.refine())
 
 
 def test_health_answers_while_a_refinement_runs() -> None:
@@ -113,7 +106,9 @@ def test_health_answers_while_a_refinement_runs() -> None:
         running.close()
 
 
-def test_a_server_without_a_plug_in_refuses_a_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_without_a_plug_in_refuses_a_refinement(
+    fusion: RunningServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     register(monkeypatch, Group.REFINERS)
-    with fusion_server() as t, pytest.raises(MissingPluginError, match="refinement: expected a plug-in"):
-        list(t.client.refine())
+    with pytest.raises(MissingPluginError, match="refinement: expected a plug-in"):
+        list(fusion.client.refine())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import grpc
 import pytest
-from fusion_running import GRID, frame, fusion_server, make_batch, make_subset, request
+from fusion_running import GRID, RunningServer, frame, fusion_server, make_batch, make_subset, request
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import (
@@ -27,34 +27,32 @@ from gausslite.wire.clients import Export, FusionClient
 ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, pb.SUBSET_STATUS_REJECTED
 
 
-def test_of_two_agents_the_one_with_the_higher_kappa_sum_wins() -> None:
-    with fusion_server() as t:
-        ant, bee = t.client.join("ant", GRID), t.client.join("bee", GRID)
-        assert ant.highest_update_seq == 0
-        assert [o.status for o in t.contribute_subsets(ant.session_id, make_subset("ant", 1, {0: [5], 1: [1]}))] == [
-            ACCEPTED
-        ]
-        assert [o.status for o in t.contribute_subsets(bee.session_id, make_subset("bee", 1, {1: [2, 2], 2: [0]}))] == [
-            ACCEPTED
-        ]
-        fused = gaussians_from_ply(t.client.export(Export("vote")))
-        assert sorted(fused.kappa.tolist()) == [0, 2, 2, 5]
-        assert len(gaussians_from_ply(t.client.export(Export("concatenation")))) == 5
-        assert gaussians_from_ply(t.client.export(Export("vote", "ant"))).kappa.tolist() == [5]
-        assert sorted(gaussians_from_ply(t.client.export(Export("concatenation", "ant"))).kappa.tolist()) == [1, 5]
-        assert t.client.join("ant", GRID).highest_update_seq == 1
+def test_of_two_agents_the_one_with_the_higher_kappa_sum_wins(fusion: RunningServer) -> None:
+    ant, bee = fusion.client.join("ant", GRID), fusion.client.join("bee", GRID)
+    assert ant.highest_update_seq == 0
+    assert [o.status for o in fusion.contribute_subsets(ant.session_id, make_subset("ant", 1, {0: [5], 1: [1]}))] == [
+        ACCEPTED
+    ]
+    assert [
+        o.status for o in fusion.contribute_subsets(bee.session_id, make_subset("bee", 1, {1: [2, 2], 2: [0]}))
+    ] == [ACCEPTED]
+    fused = gaussians_from_ply(fusion.client.export(Export("vote")))
+    assert sorted(fused.kappa.tolist()) == [0, 2, 2, 5]
+    assert len(gaussians_from_ply(fusion.client.export(Export("concatenation")))) == 5
+    assert gaussians_from_ply(fusion.client.export(Export("vote", "ant"))).kappa.tolist() == [5]
+    assert sorted(gaussians_from_ply(fusion.client.export(Export("concatenation", "ant"))).kappa.tolist()) == [1, 5]
+    assert fusion.client.join("ant", GRID).highest_update_seq == 1
 
 
-def test_a_duplicate_is_stale_and_acks_are_cumulative() -> None:
-    with fusion_server() as t:
-        session = t.client.join("ant", GRID).session_id
-        subsets = [make_subset("ant", revision, {0: [revision]}) for revision in (1, 2, 3)]
-        sent = [request(session, subset) for subset in (*subsets, subsets[0])]
-        answers = list(t.client.contribute(sent, 20.0))
-        assert [answer.acknowledged for answer in answers] == [1, 2, 3, 3]
-        assert [answer.outcomes[0].status for answer in answers] == [ACCEPTED] * 3 + [STALE]
-        assert answers[0].outcomes[0].accepted_voxels == answers[3].outcomes[0].stale_voxels == 1
-        assert gaussians_from_ply(t.client.export(Export())).kappa.tolist() == [3]
+def test_a_duplicate_is_stale_and_acks_are_cumulative(fusion: RunningServer) -> None:
+    session = fusion.client.join("ant", GRID).session_id
+    subsets = [make_subset("ant", revision, {0: [revision]}) for revision in (1, 2, 3)]
+    sent = [request(session, subset) for subset in (*subsets, subsets[0])]
+    answers = list(fusion.client.contribute(sent, 20.0))
+    assert [answer.acknowledged for answer in answers] == [1, 2, 3, 3]
+    assert [answer.outcomes[0].status for answer in answers] == [ACCEPTED] * 3 + [STALE]
+    assert answers[0].outcomes[0].accepted_voxels == answers[3].outcomes[0].stale_voxels == 1
+    assert gaussians_from_ply(fusion.client.export(Export())).kappa.tolist() == [3]
 
 
 def test_an_invalid_subset_does_not_end_the_stream() -> None:
@@ -85,92 +83,86 @@ def test_an_invalid_subset_does_not_end_the_stream() -> None:
         assert t.client.status().agents[-1].last_seen_ns > 0
 
 
-def test_a_robot_whose_agent_id_another_one_uses_is_refused() -> None:
-    with fusion_server() as t:
-        first, second = (t.client.join("ant", GRID).session_id for _ in range(2))
-        with pytest.raises(MismatchError, match="another robot uses this name"):
-            t.contribute_subsets(first, make_subset("ant", 1, {0: [1]}))
-        with pytest.raises(MismatchError):
-            t.client.leave(first)
-        other = FusionClient(t.client.address)
-        with other, pytest.raises(NameInUseError, match="end of its lease") as refused:
-            other.join("ant", GRID)
-        assert 0 < refused.value.retry_after_s <= 60
-        assert t.contribute_subsets(second, make_subset("ant", 1, {0: [1]}))[0].status == ACCEPTED
+def test_a_robot_whose_agent_id_another_one_uses_is_refused(fusion: RunningServer) -> None:
+    first, second = (fusion.client.join("ant", GRID).session_id for _ in range(2))
+    with pytest.raises(MismatchError, match="another robot uses this name"):
+        fusion.contribute_subsets(first, make_subset("ant", 1, {0: [1]}))
+    with pytest.raises(MismatchError):
+        fusion.client.leave(first)
+    other = FusionClient(fusion.client.address)
+    with other, pytest.raises(NameInUseError, match="end of its lease") as refused:
+        other.join("ant", GRID)
+    assert 0 < refused.value.retry_after_s <= 60
+    assert fusion.contribute_subsets(second, make_subset("ant", 1, {0: [1]}))[0].status == ACCEPTED
 
 
-def test_the_error_of_an_unknown_session_asks_to_join_again() -> None:
-    with fusion_server() as t:
-        with pytest.raises(SessionUnknownError):
-            t.contribute_subsets("never given", make_subset("ant", 1, {0: [1]}))
-        with pytest.raises(SessionUnknownError):
-            t.client.contribute_keyframes("never given", [frame(0)])
-        with pytest.raises(SessionUnknownError):
-            t.client.leave("never given")
-        with pytest.raises(grpc.RpcError) as caught:
-            t.stub.LeaveSession(pb.LeaveSessionRequest(session_id="x"))
-        assert caught.value.code() is grpc.StatusCode.NOT_FOUND
+def test_the_error_of_an_unknown_session_asks_to_join_again(fusion: RunningServer) -> None:
+    with pytest.raises(SessionUnknownError):
+        fusion.contribute_subsets("never given", make_subset("ant", 1, {0: [1]}))
+    with pytest.raises(SessionUnknownError):
+        fusion.client.contribute_keyframes("never given", [frame(0)])
+    with pytest.raises(SessionUnknownError):
+        fusion.client.leave("never given")
+    with pytest.raises(grpc.RpcError) as caught:
+        fusion.stub.LeaveSession(pb.LeaveSessionRequest(session_id="x"))
+    assert caught.value.code() is grpc.StatusCode.NOT_FOUND
 
 
-def test_another_mission_config_is_a_mismatch_that_names_both_values() -> None:
-    with fusion_server() as t:
-        with pytest.raises(MismatchError, match=r"0\.1 m, got 0\.2 m"):
-            t.client.join("ant", VoxelGrid(0.2))
-        session = t.client.join("ant", GRID, world_frame="map").session_id
-        t.client.join("bee", GRID)
-        with pytest.raises(MismatchError, match="world frame: expected 'map' as agreed here, got 'odom'"):
-            t.client.join("cat", GRID, world_frame="odom")
-        t.client.mission_id = "other"
-        for call in (lambda: t.client.join("cat", GRID), t.client.status, lambda: t.client.export(Export()),
-                     lambda: next(t.client.watch()), lambda: next(t.client.refine())):  # fmt: skip
-            with pytest.raises(MismatchError, match="mission: expected 'mission' as agreed here, got 'other'"):
-                call()
-        coarse = VoxelGrid(1.0)
-        subset = RoiSubset("ant", "", 1, 1, make_batch({}))
-        with pytest.raises(MismatchError, match="voxel size"):
-            t.contribute_subsets(session, subset, grid=coarse)
+def test_another_mission_config_is_a_mismatch_that_names_both_values(fusion: RunningServer) -> None:
+    with pytest.raises(MismatchError, match=r"0\.1 m, got 0\.2 m"):
+        fusion.client.join("ant", VoxelGrid(0.2))
+    session = fusion.client.join("ant", GRID, world_frame="map").session_id
+    fusion.client.join("bee", GRID)
+    with pytest.raises(MismatchError, match="world frame: expected 'map' as agreed here, got 'odom'"):
+        fusion.client.join("cat", GRID, world_frame="odom")
+    fusion.client.mission_id = "other"
+    for call in (lambda: fusion.client.join("cat", GRID), fusion.client.status, lambda: fusion.client.export(Export()),
+                 lambda: next(fusion.client.watch()), lambda: next(fusion.client.refine())):  # fmt: skip
+        with pytest.raises(MismatchError, match="mission: expected 'mission' as agreed here, got 'other'"):
+            call()
+    coarse = VoxelGrid(1.0)
+    subset = RoiSubset("ant", "", 1, 1, make_batch({}))
+    with pytest.raises(MismatchError, match="voxel size"):
+        fusion.contribute_subsets(session, subset, grid=coarse)
 
 
-def test_names_of_agents_and_missions_have_a_safe_alphabet() -> None:
-    with fusion_server() as t:
-        for name in ("", "x" * 65, "-rf", "a b", "a\nb", "a/b", "\x1b[31m", "Ünal"):
-            t.client.mission_id = ""
-            with pytest.raises(InvalidInputError, match=r"agent_id: expected 1 to 64 letters, digits and \. _ -"):
-                t.client.join(name, GRID)
-            t.client.mission_id = name
-            if name:
-                with pytest.raises(InvalidInputError, match="mission_id: expected 1 to 64 letters"):
-                    t.client.join("ant", GRID)
+def test_names_of_agents_and_missions_have_a_safe_alphabet(fusion: RunningServer) -> None:
+    for name in ("", "x" * 65, "-rf", "a b", "a\nb", "a/b", "\x1b[31m", "Ünal"):
+        fusion.client.mission_id = ""
+        with pytest.raises(InvalidInputError, match=r"agent_id: expected 1 to 64 letters, digits and \. _ -"):
+            fusion.client.join(name, GRID)
+        fusion.client.mission_id = name
+        if name:
+            with pytest.raises(InvalidInputError, match="mission_id: expected 1 to 64 letters"):
+                fusion.client.join("ant", GRID)
 
 
-def test_a_grid_is_required() -> None:
-    with fusion_server() as t, pytest.raises(grpc.RpcError) as caught:
-        t.stub.JoinSession(pb.JoinSessionRequest(agent_id="ant"))
+def test_a_grid_is_required(fusion: RunningServer) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        fusion.stub.JoinSession(pb.JoinSessionRequest(agent_id="ant"))
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
-def test_a_fresh_map_begins_at_zero_and_a_forgotten_agent_leaves_no_updates() -> None:
-    with fusion_server() as t:
-        t.contribute_subsets(t.client.join("ant", GRID).session_id, make_subset("ant", 7, {0: [1]}))
-        session = t.client.join("ant", GRID, fresh_map=True)
-        assert session.highest_update_seq == 0
-        assert t.client.status().fused_voxels == 1
-        assert t.contribute_subsets(session.session_id, make_subset("ant", 1, {1: [1]}))[0].status == ACCEPTED
-        t.client.leave(session.session_id)
-        assert t.client.status().fused_voxels == 2
-        assert not t.client.status().agents[0].joined
-        t.client.leave(t.client.join("ant", GRID).session_id, forget=True)
-        assert t.client.status().fused_voxels == 0
-        assert len(t.client.status().agents) == 0
-        assert len(gaussians_from_ply(t.client.export(Export()))) == 0
+def test_a_fresh_map_begins_at_zero_and_a_forgotten_agent_leaves_no_updates(fusion: RunningServer) -> None:
+    fusion.contribute_subsets(fusion.client.join("ant", GRID).session_id, make_subset("ant", 7, {0: [1]}))
+    session = fusion.client.join("ant", GRID, fresh_map=True)
+    assert session.highest_update_seq == 0
+    assert fusion.client.status().fused_voxels == 1
+    assert fusion.contribute_subsets(session.session_id, make_subset("ant", 1, {1: [1]}))[0].status == ACCEPTED
+    fusion.client.leave(session.session_id)
+    assert fusion.client.status().fused_voxels == 2
+    assert not fusion.client.status().agents[0].joined
+    fusion.client.leave(fusion.client.join("ant", GRID).session_id, forget=True)
+    assert fusion.client.status().fused_voxels == 0
+    assert len(fusion.client.status().agents) == 0
+    assert len(gaussians_from_ply(fusion.client.export(Export()))) == 0
 
 
-def test_an_export_of_an_unknown_agent_or_strategy_is_invalid() -> None:
-    with fusion_server() as t:
-        with pytest.raises(InvalidInputError, match="no agents yet"):
-            t.client.export(Export("vote", "ant"))
-        with pytest.raises(InvalidInputError, match="strategy"):
-            t.client.export(Export("unspecified"))
+def test_an_export_of_an_unknown_agent_or_strategy_is_invalid(fusion: RunningServer) -> None:
+    with pytest.raises(InvalidInputError, match="no agents yet"):
+        fusion.client.export(Export("vote", "ant"))
+    with pytest.raises(InvalidInputError, match="strategy"):
+        fusion.client.export(Export("unspecified"))
 
 
 def test_a_full_store_ends_the_stream_and_the_server_keeps_serving(tmp_path: Path) -> None:
@@ -217,27 +209,26 @@ def test_a_restarted_server_keeps_its_sessions_only_with_a_file(tmp_path: Path) 
     store.close()
 
 
-def test_a_draining_server_ends_open_streams_and_refuses_new_calls() -> None:
-    with fusion_server() as t:
-        session = t.client.join("ant", GRID).session_id
-        watch = t.client.watch()
-        next(watch)
-        silent = threading.Event()
+def test_a_draining_server_ends_open_streams_and_refuses_new_calls(fusion: RunningServer) -> None:
+    session = fusion.client.join("ant", GRID).session_id
+    watch = fusion.client.watch()
+    next(watch)
+    silent = threading.Event()
 
-        def one_and_then_silence():
-            yield request(session, make_subset("ant", 1, {0: [1]}))
-            silent.wait(20)
+    def one_and_then_silence():
+        yield request(session, make_subset("ant", 1, {0: [1]}))
+        silent.wait(20)
 
-        stream = t.stub.ContributeSubsets(one_and_then_silence())
-        assert next(stream).acknowledged == 1
+    stream = fusion.stub.ContributeSubsets(one_and_then_silence())
+    assert next(stream).acknowledged == 1
+    next(watch)
+    fusion.drain()
+    with pytest.raises(UnavailableError, match="draining"):
         next(watch)
-        t.drain()
-        with pytest.raises(UnavailableError, match="draining"):
-            next(watch)
-        with pytest.raises(grpc.RpcError) as caught:
-            next(stream)
-        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
-        silent.set()
-        with pytest.raises(grpc.RpcError) as caught:
-            t.stub.GetSessionStatus(pb.GetSessionStatusRequest())
-        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+    with pytest.raises(grpc.RpcError) as caught:
+        next(stream)
+    assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+    silent.set()
+    with pytest.raises(grpc.RpcError) as caught:
+        fusion.stub.GetSessionStatus(pb.GetSessionStatusRequest())
+    assert caught.value.code() is grpc.StatusCode.UNAVAILABLE

@@ -10,7 +10,7 @@ import grpc
 import numpy as np
 import pytest
 from absent_package import remove_package
-from fusion_running import CAMERA, GRID, fusion_server, make_subset, photograph
+from fusion_running import CAMERA, GRID, RunningServer, fusion_server, make_subset, photograph
 from sample_gaussians import textured_corner
 from torch_oracle.rasterizer import ReferenceRasterizer
 from waiting import wait_until
@@ -36,51 +36,46 @@ from gausslite_render.fused_view import MapRenderer
 CELLS = {0: [5, 6], 1: [7], 2: [1, 1]}
 
 
-def test_views_of_the_map_are_rendered() -> None:
-    with fusion_server() as server:
-        rgb, depth_m = server.client.render(CAMERA, np.eye(4))
-        assert not rgb.any()
-        assert not depth_m.any()
-        session = server.client.join("ant", GRID).session_id
-        server.contribute_subsets(session, make_subset("ant", 1, CELLS))
-        rgb, depth_m = server.client.render(CAMERA, np.eye(4), "refined")
-        assert rgb.shape == (24, 32, 3)
-        assert rgb.any()
-        assert depth_m.max() == pytest.approx(1.05, abs=0.15)
+def test_views_of_the_map_are_rendered(fusion: RunningServer) -> None:
+    rgb, depth_m = fusion.client.render(CAMERA, np.eye(4))
+    assert not rgb.any()
+    assert not depth_m.any()
+    session = fusion.client.join("ant", GRID).session_id
+    fusion.contribute_subsets(session, make_subset("ant", 1, CELLS))
+    rgb, depth_m = fusion.client.render(CAMERA, np.eye(4), "refined")
+    assert rgb.shape == (24, 32, 3)
+    assert rgb.any()
+    assert depth_m.max() == pytest.approx(1.05, abs=0.15)
 
 
-def test_a_server_without_the_package_refuses_views(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_without_the_package_refuses_views(fusion: RunningServer, monkeypatch: pytest.MonkeyPatch) -> None:
     remove_package(monkeypatch, "gausslite_render")
-    with (
-        fusion_server() as server,
-        pytest.raises(MissingPluginError, match="needs the package gausslite_render"),
+    with pytest.raises(MissingPluginError, match="needs the package gausslite_render"):
+        fusion.client.render(CAMERA, np.eye(4))
+
+
+def test_hostile_views_are_refused(fusion: RunningServer) -> None:
+    large = replace(CAMERA, width_px=3000, height_px=2000)
+    with pytest.raises(QuotaError, match="at most 2073600 pixels, got 6000000"):
+        fusion.client.render(large, np.eye(4))
+    with pytest.raises(PoseError):
+        fusion.client.render(CAMERA, 2 * np.eye(4))
+    good = {"camera": camera_to_message(CAMERA), "t_world_camera": transform_to_message(np.eye(4))}
+    for wrong in (
+        {"layer": 77},
+        {"camera": camera_to_message(CAMERA).__class__(width_px=1 << 31, height_px=1 << 31)},
+        {"t_world_camera": transform_to_message(np.eye(4)).__class__(row_major=[1.0] * 15)},
     ):
-        server.client.render(CAMERA, np.eye(4))
-
-
-def test_hostile_views_are_refused() -> None:
-    with fusion_server() as server:
-        large = replace(CAMERA, width_px=3000, height_px=2000)
-        with pytest.raises(QuotaError, match="at most 2073600 pixels, got 6000000"):
-            server.client.render(large, np.eye(4))
-        with pytest.raises(PoseError):
-            server.client.render(CAMERA, 2 * np.eye(4))
-        good = {"camera": camera_to_message(CAMERA), "t_world_camera": transform_to_message(np.eye(4))}
-        for wrong in (
-            {"layer": 77},
-            {"camera": camera_to_message(CAMERA).__class__(width_px=1 << 31, height_px=1 << 31)},
-            {"t_world_camera": transform_to_message(np.eye(4)).__class__(row_major=[1.0] * 15)},
-        ):
-            with pytest.raises(grpc.RpcError) as refused:
-                server.stub.RenderView(pb.RenderFusedViewRequest(**{**good, **wrong}))
-            assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
         with pytest.raises(grpc.RpcError) as refused:
-            server.stub.RenderView(pb.RenderFusedViewRequest(mission_id="another", **good))
-        assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
-        assert isinstance(CAMERA, Camera)
+            fusion.stub.RenderView(pb.RenderFusedViewRequest(**{**good, **wrong}))
+        assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+    with pytest.raises(grpc.RpcError) as refused:
+        fusion.stub.RenderView(pb.RenderFusedViewRequest(mission_id="another", **good))
+    assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
+    assert isinstance(CAMERA, Camera)
 
 
-def test_the_event_loop_answers_while_views_wait_and_too_many_are_refused_by_name() -> None:
+def test_the_event_loop_answers_while_views_wait_and_too_many_are_refused_by_name(fusion: RunningServer) -> None:
     rendering, released = Event(), Event()
 
     def render(*_: object) -> tuple[None, int]:
@@ -89,76 +84,71 @@ def test_the_event_loop_answers_while_views_wait_and_too_many_are_refused_by_nam
         return None, 1
 
     view = pb.RenderFusedViewRequest(camera=camera_to_message(CAMERA), t_world_camera=transform_to_message(np.eye(4)))
-    with patch.object(MapRenderer, "render", render), fusion_server() as server:
-        calls = [server.stub.RenderView.future(view) for _ in range(MAX_VIEWS_WAITING + 2)]
+    with patch.object(MapRenderer, "render", render):
+        calls = [fusion.stub.RenderView.future(view) for _ in range(MAX_VIEWS_WAITING + 2)]
         assert rendering.wait(20)
         wait_until(lambda: any(call.done() for call in calls))
         [refused] = [call for call in calls if call.done()]
         assert refused.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
         assert f"views: expected at most {MAX_VIEWS_WAITING} calls that wait" in refused.details()
-        require_serving(server.client.address, None)
-        assert not server.client.status().agents
+        require_serving(fusion.client.address, None)
+        assert not fusion.client.status().agents
         released.set()
         assert all(call.result(20).revision == 1 for call in calls if call is not refused)
 
 
-def test_watchers_follow_the_refined_layer() -> None:
-    with fusion_server() as server:
-        session = server.client.join("ant", GRID).session_id
-        server.contribute_subsets(session, make_subset("ant", 1, CELLS))
-        server.client.contribute_keyframes(session, [photograph(0, CELLS), photograph(1, CELLS)])
-        watched = empty_batch()
-        updates = server.client.watch(layer="refined")
-        watched = next(updates).apply_to(watched)
-        before = watched.gaussians.rgb.copy()
-        assert list(server.client.refine(iterations=3))[-1].done
-        watched = next(updates).apply_to(watched)
-        assert watched.gaussians.rgb.shape != before.shape or not np.array_equal(watched.gaussians.rgb, before)
-        # the vote is unchanged
-        vote = next(server.client.watch()).apply_to(empty_batch())
-        assert vote.gaussians.rgb == pytest.approx(before, abs=0.01)
-        updates.close()
+def test_watchers_follow_the_refined_layer(fusion: RunningServer) -> None:
+    session = fusion.client.join("ant", GRID).session_id
+    fusion.contribute_subsets(session, make_subset("ant", 1, CELLS))
+    fusion.client.contribute_keyframes(session, [photograph(0, CELLS), photograph(1, CELLS)])
+    watched = empty_batch()
+    updates = fusion.client.watch(layer="refined")
+    watched = next(updates).apply_to(watched)
+    before = watched.gaussians.rgb.copy()
+    assert list(fusion.client.refine(iterations=3))[-1].done
+    watched = next(updates).apply_to(watched)
+    assert watched.gaussians.rgb.shape != before.shape or not np.array_equal(watched.gaussians.rgb, before)
+    # the vote is unchanged
+    vote = next(fusion.client.watch()).apply_to(empty_batch())
+    assert vote.gaussians.rgb == pytest.approx(before, abs=0.01)
+    updates.close()
 
 
-def test_an_agent_follows_its_teammates_voxels() -> None:
-    with fusion_server() as server:
-        ant, bee = (server.client.join(name, GRID).session_id for name in ("ant", "bee"))
-        server.contribute_subsets(ant, make_subset("ant", 1, {0: [5], 1: [9]}))
-        server.contribute_subsets(bee, make_subset("bee", 1, {1: [1], 2: [3]}))
-        updates = server.client.watch(exclude_agent="bee")
-        batch = next(updates).apply_to(empty_batch())
-        assert batch.kappa_sums.tolist() == [5, 9]
-        # bee trains voxel 1 more and wins it: it is empty for bee
-        server.contribute_subsets(bee, make_subset("bee", 2, {1: [20]}))
-        batch = next(updates).apply_to(batch)
-        assert batch.kappa_sums.tolist() == [5]
-        updates.close()
-        with pytest.raises(InvalidInputError, match="exclude_agent_id"):
-            next(server.client.watch(layer="refined", exclude_agent="bee"))
-        with pytest.raises(InvalidInputError, match="exclude_agent_id"):
-            next(server.client.watch(exclude_agent="x" * 1000))
+def test_an_agent_follows_its_teammates_voxels(fusion: RunningServer) -> None:
+    ant, bee = (fusion.client.join(name, GRID).session_id for name in ("ant", "bee"))
+    fusion.contribute_subsets(ant, make_subset("ant", 1, {0: [5], 1: [9]}))
+    fusion.contribute_subsets(bee, make_subset("bee", 1, {1: [1], 2: [3]}))
+    updates = fusion.client.watch(exclude_agent="bee")
+    batch = next(updates).apply_to(empty_batch())
+    assert batch.kappa_sums.tolist() == [5, 9]
+    # bee trains voxel 1 more and wins it: it is empty for bee
+    fusion.contribute_subsets(bee, make_subset("bee", 2, {1: [20]}))
+    batch = next(updates).apply_to(batch)
+    assert batch.kappa_sums.tolist() == [5]
+    updates.close()
+    with pytest.raises(InvalidInputError, match="exclude_agent_id"):
+        next(fusion.client.watch(layer="refined", exclude_agent="bee"))
+    with pytest.raises(InvalidInputError, match="exclude_agent_id"):
+        next(fusion.client.watch(exclude_agent="x" * 1000))
 
 
-def test_a_declared_frame_moves_the_agents_map() -> None:
-    with fusion_server() as server:
-        T = transform_of(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
-        request = pb.JoinSessionRequest(
-            agent_id="ant", grid=grid_to_message(GRID), t_fused_agent=transform_to_message(T)
-        )
-        session = server.stub.JoinSession(request).session_id
-        server.contribute_subsets(session, make_subset("ant", 1, CELLS))
-        batch = next(server.client.watch()).apply_to(empty_batch())
-        assert (batch.gaussians.means_m[:, 2] > 2.9).all()
-        [agent] = server.client.status().agents
-        assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
-        for position, value in ((0, 5.0), (3, 1e200)):
-            wrong = pb.JoinSessionRequest(agent_id="ant", grid=request.grid, t_fused_agent=request.t_fused_agent)
-            wrong.t_fused_agent.row_major[position] = value
-            with pytest.raises(grpc.RpcError) as refused:
-                server.stub.JoinSession(wrong)
-            assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
-        [agent] = server.client.status().agents
-        assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
+def test_a_declared_frame_moves_the_agents_map(fusion: RunningServer) -> None:
+    T = transform_of(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
+    request = pb.JoinSessionRequest(agent_id="ant", grid=grid_to_message(GRID), t_fused_agent=transform_to_message(T))
+    session = fusion.stub.JoinSession(request).session_id
+    fusion.contribute_subsets(session, make_subset("ant", 1, CELLS))
+    batch = next(fusion.client.watch()).apply_to(empty_batch())
+    assert (batch.gaussians.means_m[:, 2] > 2.9).all()
+    [agent] = fusion.client.status().agents
+    assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
+    for position, value in ((0, 5.0), (3, 1e200)):
+        wrong = pb.JoinSessionRequest(agent_id="ant", grid=request.grid, t_fused_agent=request.t_fused_agent)
+        wrong.t_fused_agent.row_major[position] = value
+        with pytest.raises(grpc.RpcError) as refused:
+            fusion.stub.JoinSession(wrong)
+        assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+    [agent] = fusion.client.status().agents
+    assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
 
 
 def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the_map_as_it_is() -> None:

@@ -79,7 +79,7 @@ def test_health_and_reflection() -> None:
 
 
 def test_an_address_in_use_is_one_line_and_code_2() -> None:
-    with serving([parser_service(RuleParser())]) as server:
+    with serving([parser_service(RuleParser())], "127.0.0.1:0") as server:
         with pytest.raises(UnavailableError, match="in use"):
             asyncio.run(start_server(server.address, []))
         ended = subprocess.run(

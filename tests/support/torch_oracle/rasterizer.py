@@ -330,10 +330,7 @@ class ReferenceRasterizer:
 
 
 def _render(
-    rows: Float32[ndarray, "n 16"],
-    model: ImageModel,
-    T_camera_world: Float64[ndarray, "4 4"],
-    subset: Subset,
+    rows: Float32[ndarray, "n 16"], model: ImageModel, T_camera_world: Float64[ndarray, "4 4"], subset: Subset
 ) -> _RenderGraph:
     camera = model.camera
     require_table("rows", rows)
