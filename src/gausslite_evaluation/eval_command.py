@@ -193,7 +193,7 @@ class _Conditions:
             return cls(stated, fit_views, read_trajectory(options.map.parent), None, False, lpips)
         corrections = read_corrections(options.map.parent)
         corrections = None if corrections is None or corrections.is_identity else corrections
-        if corrections is not None and report.get("source", options.source) != options.source:
+        if corrections is not None and not _is_same_recording(report.get("source", options.source), options.source):
             print_message(f"{MAP_TO_ODOM} next to {options.map.name} corrects the poses of another source: not used")
             corrections = None
         loops = report.get("loops")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -255,16 +256,24 @@ def _frame_line(alignment: Mapping[str, Any]) -> str:
     return f"frame {state}{': ' if reason else ''}{reason}"
 
 
+def _last_contact(last_seen_ns: int) -> str:
+    """Return the age of an agent's last message, by the clocks of the server and of this machine."""
+    if not last_seen_ns:
+        return "not heard since the server's start"
+    return f"heard {max(0, time.time_ns() - last_seen_ns) // 10**9} s ago"
+
+
 def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
     yield f"fusion server, mission {status['mission_id'] or '(no agent has joined yet)'}"
     yield f"fused map  {_count(status['fused_gaussians'])} Gaussians in {_count(status['fused_voxels'])} voxels"
     yield f"keyframes  {status['keyframes']}; {'refined' if status['refined'] else 'not refined yet'}"
     for agent in status["agents"]:
-        state = "joined" if agent["joined"] else "absent"
+        state = f"{'joined' if agent['joined'] else 'absent'}, {_last_contact(int(agent['last_seen_ns']))}"
         yield (
             f"{agent['agent_id']:10} {state}; {_count(agent['gaussians'])} Gaussians, "
             f"wins {_count(agent['won_voxels'])} of {_count(agent['voxels'])} voxels, {agent['keyframes']} keyframes; "
-            f"received {_size(agent['roi_bytes'])} of the region, {_size(agent['handover_bytes'])} of handovers"
+            f"received since the server's start: {_size(agent['roi_bytes'])} of the region, "
+            f"{_size(agent['handover_bytes'])} of handovers"
         )
         yield f"           {_frame_line(agent['alignment'])}"
     if status["banned_agents"]:

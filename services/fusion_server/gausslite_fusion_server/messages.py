@@ -22,7 +22,7 @@ from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, SessionRecord
 from gausslite.fusion.refinement import RefineSettings
-from gausslite.fusion.traffic import AgentContribution
+from gausslite.fusion.traffic import AgentContribution, TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
 from gausslite.wire import convert
@@ -55,6 +55,7 @@ def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> Session
 def kept_session(engine: FusionEngine, session_id: str, caller: Caller) -> pb.KeepSessionResponse:
     """Renew the lease of a session; return what identifies the stored updates. Raises as `session_of`."""
     agent_id = session_of(engine, session_id, caller).agent_id
+    engine.traffic.record(agent_id, TrafficCounters())
     return pb.KeepSessionResponse(
         highest_update_seq=engine.store.totals(agent_id).highest_update_seq,
         incarnation_id=engine.store.incarnation_id,

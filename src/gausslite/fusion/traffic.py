@@ -108,7 +108,7 @@ class Acknowledgements:
 class TrafficCounters:
     """Messages of one agent."""
 
-    last_seen_ns: int = 0  # time of its latest subset, 0 before the first
+    last_seen_ns: int = 0  # time of its latest subset or sign of life, 0 before
     roi_bytes: int = 0  # of the region's voxels, while the mission runs
     handover_bytes: int = 0  # of the rest of the map, after it
     subsets_accepted: int = 0
@@ -130,9 +130,8 @@ class TrafficLog:
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
-        newer = replace(traffic, last_seen_ns=time.time_ns())
         with self._lock:
-            self._by_agent[agent_id] = self.of(agent_id).plus(newer)
+            self._by_agent[agent_id] = self.of(agent_id).plus(replace(traffic, last_seen_ns=time.time_ns()))
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""

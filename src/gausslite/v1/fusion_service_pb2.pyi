@@ -871,9 +871,7 @@ Global___GetSessionStatusResponse: _TypeAlias = GetSessionStatusResponse  # noqa
 
 @_typing.final
 class AgentContribution(_message.Message):
-    """What the server stores of one agent, and its traffic since it first joined, as far as
-    the server has saved it: every 10 s and when it ends.
-    """
+    """What the server stores of one agent, and its traffic since the server's start."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -912,7 +910,7 @@ class AgentContribution(_message.Message):
     last_update_seq: _builtins.int
     """The highest sequence number of its updates; 0 without any."""
     last_seen_ns: _builtins.int
-    """Time of its latest subset, by the server's clock; 0 before the first."""
+    """Time of its latest subset or KeepSession, by the server's clock; 0 before the first."""
     @_builtins.property
     def alignment(self) -> Global___FrameAlignment: ...
     @_builtins.property

@@ -34,9 +34,13 @@ def test_a_team_is_watched_ended_refined_and_fetched(
     assert main(["status", server]) == 0
     out = capsys.readouterr().out
     assert "keyframes  1; not refined yet" in out
-    assert "robot      absent" in out
+    assert "robot      absent, heard " in out
+    assert "received since the server's start: " in out
     refined, voted = tmp_path / "refined.ply", tmp_path / "voted.ply"
     assert main(["refine", server, "--iterations", "2", "--out", str(refined)]) == 0
+    capsys.readouterr()
+    assert main(["refine", server, "--iterations", "2"]) == 0
+    assert f"get it with: gausslite fetch {server} --strategy refined --out refined.ply" in capsys.readouterr().out
     assert main(["fetch", server, "--out", str(voted)]) == 0
     assert main(["fetch", server, "--strategy", "refined", "--out", str(tmp_path / "again.ply")]) == 0
     assert len(read_ply(refined)) == len(read_ply(tmp_path / "again.ply")) > 0

@@ -77,6 +77,10 @@ def test_an_invalid_subset_does_not_end_the_stream() -> None:
         assert (ant.subsets_accepted, ant.subsets_rejected, ant.gaussians, ant.voxels) == (2, 5, 3, 2)
         assert (ant.kappa_sum, ant.last_update_seq) == (3, 7)
         assert ant.last_seen_ns > 0
+        session = t.client.join("bee", GRID).session_id
+        assert t.client.status().agents[-1].last_seen_ns == 0
+        t.client.keep_session(session)
+        assert t.client.status().agents[-1].last_seen_ns > 0
 
 
 def test_a_robot_whose_agent_id_another_one_uses_is_refused(fusion: RunningServer) -> None:
