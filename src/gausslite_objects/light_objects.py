@@ -175,7 +175,9 @@ class RememberingEstimator(RelevanceEstimator):
     def restore(self, state: State) -> None:
         """Replace both. Raises MapFileError, InvalidInputError."""
         self._estimator.restore(state)
-        self._memory.restore(select_prefix(state, "light"))
+        # without one, the state was saved where nothing was remembered
+        if light := select_prefix(state, "light"):
+            self._memory.restore(light)
 
 
 def _is_part(one: ObjectLandmark, other: ObjectLandmark) -> bool:

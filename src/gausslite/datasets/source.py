@@ -244,6 +244,17 @@ def select_frames(source: Source, selection: str) -> list[int]:
     return selected
 
 
+def numbering_note(source: Source, selection: str) -> str:
+    """Return the message that a selection chooses among numbers with gaps; empty if all are chosen, or without gaps."""
+    numbers, count = source.indices(), len(select_frames(source, selection))
+    if count == len(numbers) or numbers[-1] - numbers[0] == len(numbers) - 1:
+        return ""
+    return (
+        f"frames {selection}: {count} of {len(numbers)} are chosen by their numbers, which are "
+        f"{', '.join(map(str, numbers[:3]))} ... {numbers[-1]}"
+    )
+
+
 def frame_step(selection: str) -> int:
     """Return STEP of the text "START:STOP:STEP", 1 without it. Raises InvalidInputError."""
     return _parse(selection)[2]

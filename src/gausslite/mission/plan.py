@@ -13,7 +13,7 @@ from typing import Any
 from gausslite.codec.json import graph_as_json
 from gausslite.config.option import option
 from gausslite.datasets.calibration import Calibration, StatedValues
-from gausslite.datasets.source import Source, frame_step
+from gausslite.datasets.source import Source, frame_step, numbering_note
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
@@ -92,7 +92,7 @@ class RunPlan:
         saved = None if self.resume is None else SavedRun.read(self.resume)
         prior = open_prior_map(self.prior, {} if saved is None else saved.extra, self.mission)
         recorded = FrameStream.select(open_for_mapping(self.source), self.source)
-        for note in self.notes:
+        for note in filter(None, (*self.notes, numbering_note(recorded.source, self.source.frames))):
             print_message(note)
         stated = self._stated(recorded.source, saved)
         if saved is not None:

@@ -259,8 +259,9 @@ class TaskMapper:
         if self._tracker is not None:
             self._tracker.restore(select_prefix(state, "tracker"))
         self._last_image.restore(select_prefix(state, "last_image"))
-        if self._monitor is not None:
-            self._monitor.restore(select_prefix(state, "monitor"))
+        monitor = select_prefix(state, "monitor")
+        if self._monitor is not None and monitor:
+            self._monitor.restore(monitor)
 
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.

@@ -12,7 +12,7 @@ import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.source import downscaled_size, frame_size, select_frames
+from gausslite.datasets.source import downscaled_size, frame_size, numbering_note, select_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.relevance import BallRegion, VoxelRegion
@@ -171,6 +171,8 @@ def test_the_up_axis_can_be_given(tmp_path: Path) -> None:
 def test_frames_are_selected_by_their_own_numbers(tmp_path: Path, selection: str, positions: list[int]) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq", numbers=(0, 4, 8, 12))))
     assert select_frames(source, selection) == positions
+    note = f"frames {selection}: {len(positions)} of 4 are chosen by their numbers, which are 0, 4, 8 ... 12"
+    assert numbering_note(source, selection) == ("" if len(positions) == 4 else note)
 
 
 @pytest.mark.parametrize("selection", ["", "5", "a:b", "0:10:0", "10:5", "-1:5", "0:1:2:3", "0:1.5", "0:٣"])
