@@ -174,6 +174,7 @@ def _score(home: int) -> tuple[Counter[str], list[Change]]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_most_large_changes_of_eight_homes_are_found_and_nothing_else_is_reported() -> None:
     scores = {home: _score(home) for home in HOMES}
     total = sum((verdicts for verdicts, _ in scores.values()), Counter[str]())
