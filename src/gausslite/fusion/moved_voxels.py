@@ -1,4 +1,4 @@
-"""Where the voxels of an agent in another frame lie in the fused grid: a voxel has parts in several, and of several."""
+"""Where Gaussians of an agent in another frame lie in the fused grid: by their voxel as sent, and by the fused voxel."""
 
 from __future__ import annotations
 

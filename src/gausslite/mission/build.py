@@ -128,7 +128,7 @@ def build_task_mapper(
     return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=tracker, monitor=monitor)
 
 
-class ObjectMemory(Detector, Protocol):
+class RememberingDetector(Detector, Protocol):
     """A detector that also remembers what else it sees, over all tasks of a mission."""
 
     def remember(self, estimator: RelevanceEstimator, /) -> RelevanceEstimator:
@@ -136,7 +136,7 @@ class ObjectMemory(Detector, Protocol):
         ...
 
 
-OpenMemory = Callable[[Detector, UpAxis], ObjectMemory]
+OpenMemory = Callable[[Detector, UpAxis], RememberingDetector]
 """The default of the group gausslite.object_memories."""
 
 
@@ -155,7 +155,7 @@ class EstimatorFactory:
         self._scene = functools.cache(scene)
         self._detector = chosen_detector(perception)
         self._executor: ThreadPoolExecutor | None = None
-        self._memory: ObjectMemory | None = None
+        self._memory: RememberingDetector | None = None
 
     def in_scene(self, scene: Callable[[], SceneInfo]) -> EstimatorFactory:
         """Return a factory with the same detector for another scene."""
