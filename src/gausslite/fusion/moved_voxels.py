@@ -1,4 +1,4 @@
-"""Where Gaussians of an agent in another frame lie in the fused grid: by their voxel as sent, and by the fused voxel."""
+"""Where Gaussians of an agent in another frame lie in the fused grid, by the voxel as sent and by the fused voxel."""
 
 from __future__ import annotations
 
