@@ -16,11 +16,9 @@ class NounVocabulary(Protocol):
 
     def are_one_kind(self, noun: str, other: str) -> bool:
         """Return True for synonyms, and for a noun and what it is a kind of: "desk" and "table"."""
-        ...
 
     def usual_length_m(self, phrase: str) -> float | None:
         """Return the longest side that things of this kind have; None if it is unknown."""
-        ...
 
 
 class PlainNouns:

@@ -28,26 +28,21 @@ class Pages(Protocol):
 
     def require_usable(self, option: str) -> None:
         """Raise InvalidInputError, which names the option, if a package is missing that all pages need."""
-        ...
 
     def service_page(self, port: int, listen: str, is_agent: bool, tls: Tls | None) -> AbstractContextManager[None]:
         """Show the service of this process, an agent or a fusion server, and log the page's URL.
 
         listen: the address at which the service listens. Raises InvalidInputError if its port is 0.
         """
-        ...
 
     def live_page(self, port: int, address: str, is_agent: bool) -> AbstractContextManager[str]:
         """Show an agent or a fusion server, also one that starts later; the context gives the page's URL."""
-        ...
 
     def mission_view(self, port: int) -> AbstractContextManager[BeginView]:
         """Show a mission of this process, from before it begins, and print the page's URL."""
-        ...
 
     def write_report(self, path: Path, folders: Sequence[Path]) -> None:
         """Write one HTML page of results folders. Raises MapFileError for a folder without a run, StorageError."""
-        ...
 
 
 def load_pages(purpose: str) -> Pages:

@@ -42,7 +42,7 @@ from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_m
 from gausslite_fusion_server.plugins import MessageCounts
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
 from gausslite_fusion_server.settings import ServerSettings
-from gausslite_fusion_server.watch import watched_part
+from gausslite_fusion_server.watch import watch_filter
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
 
@@ -157,7 +157,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the map, then its changes, from the owners of what is looked at."""
         await self._require_mission(request.mission_id)
-        region = watched_part(request).region
+        region = watch_filter(request).region
         async for response in self._watch.follow(request, region, self._gate.require_open):
             yield response
 

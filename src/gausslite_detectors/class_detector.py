@@ -12,7 +12,7 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
-from gausslite.domain.relevance import DetectedBox, Detection, Rival
+from gausslite.domain.relevance import CompetingClass, DetectedBox, Detection
 from gausslite.nouns import is_generic, same_kind
 from gausslite_detectors.boxes import BoxSizeLimits, box_iou, with_unseen
 from gausslite_detectors.class_match import ClassMatchSettings, TextEmbeddings, class_nouns, match_noun
@@ -223,14 +223,14 @@ class ClassDetector:
             return candidates.take(np.argsort(-candidates.scores, kind="stable")[: self._settings.max_boxes])
         return suppress(candidates, self._settings.nms_max_iou, self._settings.max_boxes, across_classes=False)
 
-    def _rival(self, query: str, classes: tuple[int, ...], overlapping: Candidates) -> Rival | None:
+    def _rival(self, query: str, classes: tuple[int, ...], overlapping: Candidates) -> CompetingClass | None:
         """Return the best overlapping detection of a different thing; None without one, and for generic nouns."""
         for row in np.argsort(-overlapping.scores, kind="stable"):
             index = int(overlapping.classes[row])
             name = self.class_names[index]
             is_other = not any(same_kind(query, noun) for noun in class_nouns(name))
             if index not in classes and not is_generic(query) and is_other:
-                return Rival(name, float(overlapping.scores[row]))
+                return CompetingClass(name, float(overlapping.scores[row]))
         return None
 
 

@@ -19,11 +19,9 @@ class KeyframeUpload(Protocol):
 
     def enqueue_newest(self, keyframes: Sequence[Keyframe], /) -> None:
         """Send the newest keyframe of the mission, if it should be sent while mapping."""
-        ...
 
     def enqueue_all(self, keyframes: Sequence[Keyframe], /) -> None:
         """Send all keyframes of the mission, as far as the limit allows; those with a corrected pose again."""
-        ...
 
 
 OpenUpload = Callable[[Uplink, VoxelGrid, int, bool], KeyframeUpload]

@@ -53,7 +53,6 @@ class TeamMap(Protocol):
 
     def close(self) -> None:
         """End the thread and the connection."""
-        ...
 
 
 OpenTeamMap = Callable[[FusionClient, str, str, MappingWorker], TeamMap]

@@ -17,7 +17,7 @@ from gausslite.domain.errors import InvalidInputError, MismatchError, RevisionGo
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph, TaskParser
-from gausslite.domain.voxel_changes import RevisionLog, VoxelChangeTracker, VoxelSignatures
+from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxels import (
     VoxelBatch,
     VoxelGrid,
@@ -28,6 +28,7 @@ from gausslite.domain.voxels import (
     select_keys,
     tombstones,
 )
+from gausslite.fusion.change_log import VoxelLog
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
@@ -65,7 +66,7 @@ class MapChangeLog:
         self._grid = grid
         self._roi_only = roi_only
         self._tracker = VoxelChangeTracker()
-        self._log: RevisionLog | None = None
+        self._log: VoxelLog | None = None
         self._batch = empty_batch()
 
     @property
@@ -84,8 +85,9 @@ class MapChangeLog:
         counts = voxels.counts.astype(np.uint32)
         self._batch = VoxelBatch(voxels.keys, signatures.kappa_sums.copy(), counts, shown.take(voxels.rows))
         if self._log is None:
-            self._log = RevisionLog(revision)
-        self._log.record(signatures.keys[changed].tolist(), removed.tolist(), revision)
+            self._log = VoxelLog(revision)
+        self._log.record(signatures.keys[changed], removed, revision=revision)
+        self._log.revision = revision  # also of a map that is the same as before
 
     def since(self, revision: int) -> VoxelBatch:
         """Return updates of all voxels that changed after a revision; 0: the whole map. Raises RevisionGoneError."""

@@ -44,7 +44,8 @@ class Acknowledger:
         self, request: pb.ContributeSubsetsRequest, agent_id: str, error: GaussLiteError
     ) -> pb.ContributeSubsetsResponse:
         """Return the acknowledgement of a refused message. Raises an error that every later message would meet too."""
-        reason = "UNAVAILABLE" if isinstance(error, UnavailableError) else code_and_reason(error)[1]
+        reason = code_and_reason(error)[1]
+        # `CallInterceptor` records the errors that end a stream, all but UnavailableError
         if isinstance(error, UnavailableError) or not isinstance(error, STREAM_ERRORS):
             self._rejections.record(self._caller.key, reason, str(error))
         if isinstance(error, STREAM_ERRORS):

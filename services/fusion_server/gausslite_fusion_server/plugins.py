@@ -56,7 +56,6 @@ class MapRenderer(Protocol):
         self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer, /
     ) -> tuple[Rendering | None, int]:
         """Return a view of a layer, None of an empty one, and the layer's revision. Raises KernelError."""
-        ...
 
 
 OpenRenderer = Callable[[FusedMapLayers, CreateRasterizer], MapRenderer]
@@ -72,11 +71,9 @@ class Refiner(Protocol):
         Raises QuotaError if another refinement runs or the map exceeds max_gaussians, InvalidInputError if no keyframe
         agrees with the map.
         """
-        ...
 
     def close(self) -> None:
         """Wait until the last refinement has ended after its cancellation."""
-        ...
 
 
 OpenRefiner = Callable[[CreateRasterizer], Refiner]
@@ -99,11 +96,9 @@ class Share(Protocol):
 
     def engine(self) -> FusionEngine:
         """Return the engine of the part that this server owns. Raises UnavailableError while it is opened."""
-        ...
 
     def counts(self) -> MessageCounts:
         """Return how much of the mission's work this server has done."""
-        ...
 
 
 class Database(Protocol):
@@ -111,11 +106,9 @@ class Database(Protocol):
 
     def open_store(self, url: str) -> FusionStore:
         """Return the store of a database for one server."""
-        ...
 
     def open_share(self, settings: ServerSettings, url: str, peer_address: str) -> AbstractAsyncContextManager[Share]:
         """Take part in the mission of a database, together with other servers, while the context is open."""
-        ...
 
 
 def open_store(settings: ServerSettings) -> FusionStore:

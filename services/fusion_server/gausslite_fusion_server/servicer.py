@@ -14,12 +14,14 @@ from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport, TeamObject
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.refinement import CreateRasterizer, RefineSettings
 from gausslite.plugins import Group, load
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.v1 import geometry_pb2
 from gausslite.wire import convert
 from gausslite.wire.call_limits import RejectionLog
 from gausslite.wire.convert_task import graph_from_message, object_to_message, report_from_message
@@ -31,7 +33,7 @@ from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server import messages
 from gausslite_fusion_server.contributions import Acknowledger, StoredCount
 from gausslite_fusion_server.plugins import MapRenderer, OpenRefiner, OpenRenderer, Refiner
-from gausslite_fusion_server.watch import FusedMapReader, watched_part
+from gausslite_fusion_server.watch import FusedMapReader, watch_filter
 
 _Message = TypeVar("_Message")
 _log = logging.getLogger(__name__)
@@ -183,7 +185,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Join the mission."""
         Caller.of(context).require_agent(request.agent_id)
-        grid = convert.grid_from_message(request.grid)
+        grid = VoxelGrid(request.grid.size_m)
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
         messages.declared_frame_from_message(request)
@@ -200,7 +202,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             session_id=joined.session.session_id,
             highest_update_seq=joined.highest_update_seq,
             fused_revision=joined.fused_revision,
-            grid=convert.grid_to_message(self.engine.grid),
+            grid=geometry_pb2.VoxelGrid(size_m=self.engine.grid.size_m),
             max_subset_bytes=MAX_SUBSET_BYTES,
             max_gaussians=self.engine.settings.quotas.gaussians_per_agent,
             keyframes=joined.keyframes,
@@ -264,7 +266,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
         self.engine.members.require_mission(request.mission_id)
-        watched = watched_part(request)
+        watched = watch_filter(request)
         reader = FusedMapReader(self.engine, watched, self._encoded_parts, request.since_revision)
 
         async def read(_since_revision: int) -> FusedMapReader:
@@ -356,7 +358,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         status = await self._work(context, self.engine.status)
         return pb.GetSessionStatusResponse(
             mission_id=status.mission_config.mission_id,
-            grid=convert.grid_to_message(self.engine.grid),
+            grid=geometry_pb2.VoxelGrid(size_m=self.engine.grid.size_m),
             world_frame=status.mission_config.world_frame,
             fused_revision=status.revision,
             agents=map(messages.contribution_to_message, status.agents),

@@ -32,15 +32,15 @@ _SENDER = "fusion-server"
 
 
 @dataclass(frozen=True, slots=True)
-class WatchedPart:
-    """What a watcher wants: a layer, the part in a region, without the voxels that one agent wins."""
+class WatchFilter:
+    """Which voxels of the fused map a watcher wants."""
 
     layer: MapLayer
-    region: AxisAlignedBox | None = None
-    exclude_agent: str = ""
+    region: AxisAlignedBox | None = None  # None: everywhere
+    exclude_agent: str = ""  # without the voxels that this agent wins; empty: all
 
 
-def watched_part(request: pb.WatchFusedMapRequest) -> WatchedPart:
+def watch_filter(request: pb.WatchFusedMapRequest) -> WatchFilter:
     """Return what a watcher asks for. Raises InvalidInputError."""
     layer, exclude_agent = layer_from_message(request.layer), request.exclude_agent_id
     if exclude_agent:
@@ -48,7 +48,7 @@ def watched_part(request: pb.WatchFusedMapRequest) -> WatchedPart:
         if layer is MapLayer.REFINED:
             raise InvalidInputError("exclude_agent_id: expected none with REFINED, whose voxels belong to everyone")
     region = box_from_message(request.region) if request.HasField("region") else None
-    return WatchedPart(layer, region, exclude_agent)
+    return WatchFilter(layer, region, exclude_agent)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,69 +56,70 @@ class FusedMapReader:
     """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers."""
 
     engine: FusionEngine
-    watched: WatchedPart
+    wanted: WatchFilter
     cache: EncodedPartCache
     since_revision: int = 0  # where the watcher begins; from there it gets all changes as one
 
     def snapshot(self) -> tuple[int, Parts]:
         """Return the current revision and the tiles of the layer, each as it is when it is read."""
-        revision, tiles = self.engine.maps.tiles(self.watched.layer)
+        revision, tiles = self.engine.maps.tiles(self.wanted.layer)
         return revision, (self._tile(tile) for tile in self._in_region(tiles).tolist())
 
     def changes(self, since_revision: int) -> tuple[int, Parts]:
-        """Return the current revision and what changed since, or more. Raises RevisionGoneError."""
-        newest = self.engine.maps.revision(self.watched.layer)
+        """Return a revision and what has changed until then; it may have more changes. Raises RevisionGoneError."""
+        newest = self.engine.maps.revision(self.wanted.layer)
         if newest == since_revision:
             return since_revision, ()
+        # a step from one revision to the next is the same for all watchers that follow, so that the map is read and
+        # encoded once for them; the first step of a watcher is its own, from wherever it was before
         is_first = since_revision == self.since_revision
-        shared = replace(self.watched, exclude_agent="")
-        revision = newest if is_first else self.cache.step((shared, since_revision), newest)
+        everyone = replace(self.wanted, exclude_agent="")
+        revision = newest if is_first else self.cache.step((everyone, since_revision), newest)
 
-        # the map is read once for all watchers that follow closely
-        def encode(watched: WatchedPart) -> tuple[EncodedPart, ...]:
-            changes = self.engine.maps.changes(since_revision, watched.layer)
-            won = self._select(watched, changes.won)
+        def encode(wanted: WatchFilter) -> tuple[EncodedPart, ...]:
+            changes = self.engine.maps.changes(since_revision, wanted.layer)
+            won = self._select(wanted, changes.won)
             changed = np.union1d(changes.won.batch.keys, changes.removed)
-            if watched.region is not None:
-                changed = changed[watched.region.contains(self.engine.grid.centres_m(changed))]
+            if wanted.region is not None:
+                changed = changed[wanted.region.contains(self.engine.grid.centres_m(changed))]
             return _encode(won, np.setdiff1d(changed, won.batch.keys), self.engine.grid)
 
-        return revision, (self._shared(self.watched, (since_revision, revision), encode),)
+        return revision, (self._shared(self.wanted, (since_revision, revision), encode),)
 
     def _tile(self, tile: int) -> tuple[EncodedPart, ...]:
         """Return a tile as it is now; a tile completely in the region is shared with other watchers."""
-        watched = self.watched
-        if watched.region is not None and _contains(watched.region, tile, self.engine.grid):
-            watched = replace(watched, region=None)
+        wanted = self.wanted
+        if wanted.region is not None and _contains(wanted.region, tile, self.engine.grid):
+            wanted = replace(wanted, region=None)
         # read before the tile: a change in between makes the kept tile newer than its revision, never older
-        revision = self.engine.maps.tile_revision(watched.layer, tile)
+        revision = self.engine.maps.tile_revision(wanted.layer, tile)
 
-        def encode(watched: WatchedPart) -> tuple[EncodedPart, ...]:
-            won = self._select(watched, self.engine.maps.tile(watched.layer, tile))
+        def encode(wanted: WatchFilter) -> tuple[EncodedPart, ...]:
+            won = self._select(wanted, self.engine.maps.tile(wanted.layer, tile))
             return _encode(won, np.zeros(0, np.int64), self.engine.grid)
 
-        return self._shared(watched, (tile, revision), encode)
+        return self._shared(wanted, (tile, revision), encode)
 
     def _shared(
-        self, watched: WatchedPart, key: tuple[int, int], encode: Callable[[WatchedPart], tuple[EncodedPart, ...]]
+        self, wanted: WatchFilter, key: tuple[int, int], encode: Callable[[WatchFilter], tuple[EncodedPart, ...]]
     ) -> tuple[EncodedPart, ...]:
         """Return parts from the cache; an agent that wins nothing in them is excluded by those of all watchers."""
-        everyone = replace(watched, exclude_agent="")
+        everyone = replace(wanted, exclude_agent="")
         parts = self.cache.get((everyone, *key), partial(encode, everyone))
         winners = {name for _, provenance in parts if provenance is not None for name in provenance.agent_ids}
-        if watched.exclude_agent in winners:
-            return self.cache.get((watched, *key), partial(encode, watched))
+        if wanted.exclude_agent in winners:
+            return self.cache.get((wanted, *key), partial(encode, wanted))
         return parts
 
-    def _select(self, watched: WatchedPart, won: WonVoxels) -> WonVoxels:
-        if watched.exclude_agent:
-            won = won.without(watched.exclude_agent)
-        if watched.region is None:
+    def _select(self, wanted: WatchFilter, won: WonVoxels) -> WonVoxels:
+        if wanted.exclude_agent:
+            won = won.without(wanted.exclude_agent)
+        if wanted.region is None:
             return won
-        return WonVoxels(crop_to_box(won.batch, watched.region, self.engine.grid), won.keys_by_winner)
+        return WonVoxels(crop_to_box(won.batch, wanted.region, self.engine.grid), won.keys_by_winner)
 
     def _in_region(self, tiles: np.ndarray) -> np.ndarray:
-        grid, region = self.engine.grid, self.watched.region
+        grid, region = self.engine.grid, self.wanted.region
         if region is None:
             return tiles
         low_m = grid.indices(tiles) * grid.size_m

@@ -28,8 +28,8 @@ from gausslite.domain.state import State
 FORMAT = "gausslite-state"
 VERSION = "2"
 _TYPES = {"BOOL", "U8", "I16", "I32", "U32", "I64", "U64", "F32", "F64"}
-_LENGTH_BYTES = 8
-_MAX_HEADER_BYTES = 1 << 24
+_LENGTH_BYTES, _MAX_HEADER_BYTES = 8, 1 << 24
+"""A safetensors file begins with the length of its JSON header, which is checked before anything is allocated."""
 
 
 def write_atomic(path: Path, data: bytes) -> None:

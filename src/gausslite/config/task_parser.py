@@ -20,7 +20,6 @@ class ParserBackend(Protocol):
 
     def open(self) -> TaskParser:
         """Return the parser; this may load a model. Raises InvalidInputError."""
-        ...
 
 
 class DefaultParser:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
@@ -16,8 +16,7 @@ from gausslite.domain.relevance import TargetPoint
 from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
 
 AUTO, NONE = "auto", "none"
-
-
+Value = TypeVar("Value")
 CAMERA_FORM = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
 CORRECTION_FORM = "lens=MODEL:K1,...;readout=S;offset=S"
 PRIOR_FORM = "M,DEG[,GAIN,OFFSET]"
@@ -105,11 +104,6 @@ def write_correction(correction: CameraCorrection | str) -> str:
     return NONE if isinstance(correction, CameraCorrection) and correction.is_identity else str(correction)
 
 
-def read_correction_or_auto(text: str) -> CameraCorrection | str:
-    """Return AUTO, or the correction that `read_correction` returns. Raises InvalidInputError."""
-    return text if text == AUTO else read_correction(text)
-
-
 def read_prior(text: str) -> PoseExposurePrior:
     """Return the prior of NONE (exact poses) or of numbers. Raises InvalidInputError."""
     return PoseExposurePrior() if text == NONE else PoseExposurePrior.parse(text)
@@ -120,6 +114,6 @@ def write_prior(prior: PoseExposurePrior | str) -> str:
     return NONE if isinstance(prior, PoseExposurePrior) and prior.is_exact else str(prior)
 
 
-def read_prior_or_auto(text: str) -> PoseExposurePrior | str:
-    """Return AUTO, or the prior that `read_prior` returns. Raises InvalidInputError."""
-    return text if text == AUTO else read_prior(text)
+def or_auto(read: Callable[[str], Value]) -> Callable[[str], Value | str]:
+    """Return what reads AUTO, which stays, or a text that `read` reads."""
+    return lambda text: text if text == AUTO else read(text)

@@ -84,19 +84,15 @@ class Calibrator(Protocol):
         report: gets the evidence of each value as soon as it is known. Raises DatasetError, also for poses or depth
         that contradict the images, PoseError, InvalidInputError.
         """
-        ...
 
     def intentions(self, source: Source, stated: StatedValues, /) -> tuple[str, ...]:
         """Return what `calibrate` will estimate and how long it takes, as messages for the operator."""
-        ...
 
     def contradictions(self, source: Source, /) -> tuple[str, ...]:
         """Return how poses or depth contradict the images, as messages for the operator."""
-        ...
 
     def undistorted_colour(self, source: Source, /) -> Source:
         """Return a source with the lens of its colour camera removed from colour alone, whose intrinsics it keeps."""
-        ...
 
     def live_frame(self, frame: Frame, lens: Lens | None, /) -> Frame:
         """Return the frame without lens distortion; its motion states rolling shutter and blur of the returned image.
@@ -104,7 +100,6 @@ class Calibrator(Protocol):
         lens: that of the recorded image, None for a pinhole. Raises InvalidInputError for a lens without a usable
         pinhole camera, MissingPluginError.
         """
-        ...
 
 
 class StatedOnly:

@@ -61,11 +61,9 @@ class CameraReader(Protocol):
     @property
     def patterns(self) -> tuple[str, ...]:
         """Patterns of the files' names."""
-        ...
 
     def read(self, path: Path, width_px: int, height_px: int, /) -> FolderCamera | None:
         """Return the camera for images of this size; None for a file of another kind. Raises DatasetError."""
-        ...
 
 
 def read_folder_camera(

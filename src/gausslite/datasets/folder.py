@@ -192,11 +192,9 @@ class FolderSourceClass(Protocol):
 
     def __call__(self, path: Path, up_axis: UpAxis | None, require_poses: bool, /) -> Source:
         """Return the sequence. Raises DatasetError, PoseError."""
-        ...
 
     def recognises(self, path: Path, /) -> bool:
         """True if the path has this layout."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

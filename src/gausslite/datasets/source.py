@@ -152,20 +152,16 @@ class SourceReader(Protocol):
     @property
     def layout(self) -> str:
         """The folders that it opens, by names of their files, for messages; empty for none."""
-        ...
 
     @property
     def address(self) -> str:
         """What it opens that is no folder, such as "a ROS bag", for messages; empty for none."""
-        ...
 
     def recognises(self, address: str) -> bool:
         """True if an address without a name is of this kind, by the names of files."""
-        ...
 
     def open(self, address: str, up_axis: UpAxis | None, require_poses: bool, /) -> Source:
         """Return the sequence, as `open_source` does. Raises DatasetError, PoseError, InvalidInputError."""
-        ...
 
 
 def require_position(source_name: str, i: int, count: int) -> None:

@@ -16,12 +16,8 @@ def require_array(name: str, value: NDArray[Any], shape: tuple[int | None, ...],
     if not isinstance(value, np.ndarray) or value.dtype != expected:
         received = getattr(value, "dtype", type(value).__name__)
         raise ShapeError(f"{name}: expected an array of {expected}, got {received}")
-    if value.shape == shape:
-        return
-    matches = len(value.shape) == len(shape) and all(
-        length is None or length == actual for length, actual in zip(shape, value.shape, strict=True)
-    )
-    if not matches:
+    is_same = len(value.shape) == len(shape)
+    if not is_same or any(own not in (None, actual) for own, actual in zip(shape, value.shape, strict=True)):
         pattern = "(" + ", ".join("*" if length is None else str(length) for length in shape) + ")"
         raise ShapeError(f"{name}: expected shape {pattern}, got {value.shape}")
 

@@ -33,7 +33,6 @@ class Region(Protocol):
 
     def mask(self, frame: Frame) -> Bool[ndarray, "h w"]:
         """Return True where the frame shows the region."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +155,7 @@ def _world_points(frame: Frame, window: tuple[slice, slice]) -> Float[ndarray, "
 
 
 @dataclass(frozen=True, slots=True)
-class Rival:
+class CompetingClass:
     """A class of a different thing that a detector finds in the same place, and its score."""
 
     name: str  # the class that was detected
@@ -174,7 +173,7 @@ class Detection:
     score: float
     box_px: tuple[float, float, float, float]
     mask: Bool[ndarray, "h w"]  # the object's pixels
-    rival: Rival | None = None  # None without another class
+    rival: CompetingClass | None = None  # None without another class
     is_weak: bool = False
     is_exact: bool = False  # the mask is ground truth, not a network's
     class_name: str = ""  # of the detector, empty if it has none
@@ -187,7 +186,7 @@ class DetectedBox:
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]  # left, top, right, bottom
-    rival: Rival | None = None
+    rival: CompetingClass | None = None
     is_weak: bool = False
     class_name: str = ""
 

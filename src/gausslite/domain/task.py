@@ -168,7 +168,6 @@ class TaskParser(Protocol):
 
     def parse(self, text: str) -> TaskGraph:
         """Return the graph of one task. Raises TaskError if the text is empty, too long or names no object."""
-        ...
 
 
 def noun_of(name: str) -> str:

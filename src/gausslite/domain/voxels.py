@@ -16,6 +16,7 @@ from gausslite.domain.gaussians import Gaussians
 
 MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
 BITS_PER_AXIS = 21
+"""Of a key: three axes fit into 63 bits, so that keys are positive."""
 _OFFSET = 1 << (BITS_PER_AXIS - 1)
 _MASK = (1 << BITS_PER_AXIS) - 1
 TILE_VOXELS = 16
@@ -251,6 +252,7 @@ def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]
     """Return the indices start, start + 1, … of every run (start, count), concatenated."""
     ends = np.cumsum(counts, dtype=np.int64)
     total = int(ends[-1]) if len(ends) else 0
+    # each run is a part of 0, 1, 2, … moved to where it starts
     shift = np.repeat(starts.astype(np.int64) - (ends - counts), counts)
     rows: NDArray[np.int64] = np.arange(total, dtype=np.int64) + shift
     return rows
@@ -272,6 +274,7 @@ def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """Return the voxels of the batch that are in `keys`, which may be unsorted."""
     wanted = np.unique(keys)
     rows = np.searchsorted(batch.keys, wanted)
+    # -1, which is no key, stands behind the last one: a search beyond it finds nothing
     rows = rows[np.append(batch.keys, np.int64(-1))[rows] == wanted]
     counts, starts = batch.counts[rows], batch.offsets[rows]
     gaussians = batch.gaussians.take(gather_rows(starts, counts))

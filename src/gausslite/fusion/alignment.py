@@ -87,7 +87,6 @@ class FrameAligner(Protocol):
 
         at_most: number of agents to compare, those first whose latest comparison is the oldest.
         """
-        ...
 
     def close(self) -> None:
         """End the comparison that runs, if any, and its process."""

@@ -12,10 +12,10 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import RevisionGoneError
-from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.fusion.packed_table import PackedTable, Table, keys_of, places_of, tiles_at
 from gausslite.fusion.vote import VoteResult
 
+MAX_REMOVED_VOXELS = 100_000
 _CHANGED = np.dtype([("winners", "u2"), ("counts", "u4"), ("revisions", "i8")])
 _NOBODY = (1 << 16) - 1
 _ABSENT = np.array((_NOBODY, 0, 0), _CHANGED)
@@ -23,14 +23,14 @@ _NO_TILE = np.array((0, 0), np.dtype([("voxels", "u4"), ("revisions", "i8")]))
 
 
 class VoxelLog:
-    """One layer of the fused map: its voxels, and the revision of the last change of each and of each tile.
+    """One layer of a map: its voxels, and the revision of the last change of each and of each tile.
 
     It has 22 bytes for each voxel of the layer, and the latest `max_removed` voxels that became empty. A watcher that
     misses an older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a
     restart. A tile has 16 x 16 x 16 voxels; its name is the smallest key that it can hold. Not thread-safe.
     """
 
-    def __init__(self, first_revision: int, max_removed: int) -> None:
+    def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:
         self.revision = self._oldest = first_revision
         self._max_removed = max_removed
         self._voxels, self._tiles = PackedTable(_ABSENT), PackedTable(_NO_TILE)
@@ -86,14 +86,21 @@ class VoxelLog:
         """Record as one revision that these voxels of the layer have changed."""
         self.record(keys, np.zeros(0, np.int64), self.find(keys))
 
-    def record(self, changed: Int64[ndarray, " k"], removed: Int64[ndarray, " r"], won: Table | None = None) -> None:
+    def record(
+        self,
+        changed: Int64[ndarray, " k"],
+        removed: Int64[ndarray, " r"],
+        won: Table | None = None,
+        revision: int | None = None,
+    ) -> None:
         """Record as one revision that these voxels changed or became empty; nothing without any.
 
-        Keys ascend. won: the winner of each changed voxel, and the number of its Gaussians.
+        Keys ascend. won: the winner of each changed voxel, and the number of its Gaussians. revision: its number, by
+        default the next one.
         """
         if not (len(changed) or len(removed)):
             return
-        self.revision += 1
+        self.revision = self.revision + 1 if revision is None else revision
         keys, elements = np.append(changed, removed), np.full(len(changed) + len(removed), _ABSENT)
         elements[: len(changed)] = 0 if won is None else won
         elements["revisions"][: len(changed)] = self.revision

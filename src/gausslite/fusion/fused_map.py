@@ -264,6 +264,7 @@ class FusedMapLayers:
         """Record that what the vote reads changed in these voxels of each agent, with one vote on all of them."""
         if not changed_keys:
             return
+        # the vote is a pure function of the store: on these voxels it is what a vote on all would give
         vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
         fused_changes = self._change_log.record(changed_keys, vote)
         if self._refined_log is not self._voted_log:

@@ -12,8 +12,8 @@ from gausslite.config.option import option
 from gausslite.config.values import VOXEL_SIZE
 from gausslite.domain.checks import quote_name, require_identifier, require_name
 from gausslite.domain.errors import InvalidInputError, MismatchError, QuotaError
-from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.change_log import MAX_REMOVED_VOXELS
 
 DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/channel.py."""

@@ -1,4 +1,4 @@
-"""Where Gaussians of an agent in another frame lie in the fused grid, by the voxel as sent and by the fused voxel."""
+"""Where the Gaussians of an agent whose frame is corrected lie in the fused grid: by sent voxel, and by fused voxel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Pairs = NDArray[Any]
 _NO_CELL = -1
 """The cell of a source that is used nowhere."""
 _RATIO = 4
-"""How much larger a run is than the next one, at least."""
+"""How much larger a run is than the next one, at least, so that a pair is sorted anew only a few times."""
 
 
 class MovedVoxels:
@@ -54,8 +54,9 @@ class MovedVoxels:
 
     def replace(self, sources: Int64[ndarray, " a"], pairs: Pairs) -> Int64[ndarray, " k"]:
         """Replace the pairs of these voxels, all different; returns the fused voxels that may change."""
-        as_sent = sources[~self.has(sources)]
+        as_sent = sources[~self.has(sources)]  # until now these lay where they were sent
         before = self.remove(sources)
+        # a source without pairs is remembered too, else it would count as used where it was sent
         unused = np.setdiff1d(sources, pairs["sources"])
         nowhere = np.zeros(len(unused), PAIRS)
         nowhere["sources"], nowhere["cells"], nowhere["counts"] = unused, _NO_CELL, 1

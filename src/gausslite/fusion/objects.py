@@ -77,7 +77,6 @@ class MergedObjects(Protocol):
 
         frames: T_fused_agent of the agents whose frame differs from the fused map's. Raises InvalidInputError.
         """
-        ...
 
 
 def open_merged_objects(store: FusionStore) -> MergedObjects | None:

@@ -94,10 +94,10 @@ def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
 
 
 class _Map:
-    """What is known of a map.
+    """The totals of one map, by voxel and by tile.
 
-    tiles: the size of a tile's rows (written), and of its voxels in them (used), in units; its digest and its first
-    row. more_rows: the others of tiles that have several; added_rows: their number.
+    tiles: the size of a tile's rows in the store (written) and of the voxels that are still valid in them (used), in
+    units; its digest and its first row. more_rows: the others of tiles that have several; added_rows: their number.
     """
 
     def __init__(self) -> None:
@@ -178,6 +178,7 @@ class ScoreIndex:
             added[column] = scores[column]
         places = places_of(keys)
         before = own.voxels.put(places, added)
+        # each tile changes by the difference of its voxels, so that a message costs its own size
         was_there = before["rows"] >= 0
         sizes = added["counts"].astype(np.int64) + VOXEL_UNITS
         sizes -= np.where(was_there, before["counts"].astype(np.int64) + VOXEL_UNITS, 0)
@@ -192,7 +193,10 @@ class ScoreIndex:
         own.totals = own.totals.replace_part(before, added)
 
     def outdated_rows(self, name: str, tiles: Int64[ndarray, " t"], spare: int, at_most: int) -> dict[int, list[int]]:
-        """Return the rows of tiles of which more than half, and than `spare`, is outdated: of about so many units."""
+        """Return the rows to write anew of tiles that are outdated by more than half and by more than `spare` units.
+
+        at_most: units of the rows, about.
+        """
         own = self._map(name)
         found = own.tiles.get(places_of(tiles))
         written, used = (found[column].astype(np.int64) for column in ("written", "used"))
@@ -209,11 +213,13 @@ class ScoreIndex:
         own, tiles = self._maps[name], rows["tiles"]
         places, first, index = np.unique(places_of(tiles), return_index=True, return_inverse=True)
         found = own.tiles.get(places)
+        # the rows of emptied tiles leave first, because the new ones are counted from zero
         gone = places.searchsorted(places_of(np.array(list(emptied), np.int64)))
         found["written"][gone], found["rows"][gone] = 0, -1
         for tile in emptied:
             own.added_rows -= len(own.more_rows.pop(tile, ()))
         np.add.at(found["written"], index, rows["sizes"].astype(np.uint32))
+        # most tiles have one row, which the table holds without an object of its own
         is_first = found["rows"] < 0
         found["rows"][is_first] = rows["numbers"][first[is_first]]
         own.tiles.put(places, found)
@@ -228,6 +234,7 @@ class ScoreIndex:
         places, tiles = own.tiles.last(max(at_most // _LEAST_SIZE, 1))
         voxels = own.voxels.last(len(own.voxels))[0]
         counts = np.diff(voxels.searchsorted(places), append=len(voxels))
+        # from the end, where deleting moves no other voxel of the table
         first, columns = len(places), (keys_of(places), counts, tiles["rows"])
         for tile, count, row in zip(*(column[::-1].tolist() for column in columns), strict=True):
             own_rows = [row, *own.more_rows.get(tile, ())]

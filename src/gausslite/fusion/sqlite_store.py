@@ -21,6 +21,7 @@ from gausslite.fusion.migrations import Step, missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
 
+# lost pages take rows away without a wrong checksum: the last commit has the sum of their numbers
 _ROW_SUM = "(SELECT coalesce(sum(number), 0) FROM voxel_updates)"
 _log = logging.getLogger(__name__)
 
@@ -34,6 +35,7 @@ RESTORE_ADVICE = (
 )
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 _CHECKPOINT_PERIOD_S, _FREE_ROUNDS = 4.0, 3
+"""The log is copied this often: first in rounds beside the commits, then the short rest while none runs."""
 # 256 MiB: only where the checkpoints in the background do not keep up
 _CHECKPOINT_PAGES = 65536
 _SCHEMA = f"""
@@ -158,9 +160,10 @@ def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
         db = opened.enter_context(contextlib.closing(connect(path)))
         _create_tables(db)
         return db
-    opened.enter_context(locked(path))
+    opened.enter_context(locked(path))  # before anything is read: another server may be writing
     is_new = not path.exists()
     if is_new:
+        # SQLite would delete the log, which may have the last acknowledged updates
         if Path(f"{path.resolve()}-wal").exists():
             raise StorageError(
                 f"store {path}: expected the file of its log {path.name}-wal, got none; {RESTORE_ADVICE}"
@@ -178,6 +181,7 @@ def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
         db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
         # of a store that an earlier release made
         db.execute(f"INSERT OR IGNORE INTO properties VALUES ('row_sum', {_ROW_SUM})")  # noqa: S608
+        # the head is beside the store: it shows that the store is older than what was acknowledged
         head = content_of(db, path) if is_new else CommitHead(path).read()
         require_newest(db, path, head)
         if head is None and content_of(db, path)[1]:

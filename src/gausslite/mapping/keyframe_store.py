@@ -57,7 +57,7 @@ class KeyframeStore:
         self._recent: list[FrameId] = []
         self._long_term: list[FrameId] = []
         self._buffer: list[FrameId] = []
-        self._mapped_frames = self._count = 0
+        self._mapped_frames = self.count = 0  # count: keyframes of the whole mission
 
     @property
     def window(self) -> tuple[WindowView, ...]:
@@ -79,12 +79,7 @@ class KeyframeStore:
     @property
     def next_anchor(self) -> int:
         """Number of the keyframe that the next frame follows: its own, or that of the newest keyframe."""
-        return self._count if self.next_is_keyframe else self._count - 1
-
-    @property
-    def count(self) -> int:
-        """Number of keyframes of the mission."""
-        return self._count
+        return self.count if self.next_is_keyframe else self.count - 1
 
     @property
     def next_is_keyframe(self) -> bool:
@@ -99,7 +94,7 @@ class KeyframeStore:
         self._limit_for(view.keyframe)
         is_keyframe = self.next_is_keyframe
         self._mapped_frames += 1
-        self._count += is_keyframe
+        self.count += is_keyframe
         new = view.keyframe.frame.id
         for frames in (self._recent, self._long_term, self._buffer):
             if new in frames:
@@ -139,7 +134,8 @@ class KeyframeStore:
             return
         if frame not in self._views:
             self._views[frame] = prepare(keyframe)
-        self._set_long_term(sorted([*self._long_term, frame], key=self._capture_time_ns))
+        by_time = sorted([*self._long_term, frame], key=lambda own: self._keyframes[own].frame.capture_time_ns)
+        self._set_long_term(by_time)
 
     def reset_roi(self) -> None:
         """Mark all keyframes as not evaluated for the new task; their relevance is empty until then."""
@@ -185,7 +181,7 @@ class KeyframeStore:
             "recent": int_array(*(number[frame] for frame in self._recent)),
             "long_term": int_array(*(number[frame] for frame in self._long_term)),
             "buffer": int_array(*(number[frame] for frame in self._buffer)),
-            "counts": int_array(self._mapped_frames, self._count),
+            "counts": int_array(self._mapped_frames, self.count),
         }
         for frame, i in number.items():
             state |= add_prefix(str(i), self._keyframes[frame].state())
@@ -212,7 +208,7 @@ class KeyframeStore:
         self._views = {frame: prepare(self._keyframes[frame]) for frame in in_window}
         for keyframe in keyframes.values():
             self._limit_for(keyframe)
-        self._mapped_frames, self._count = get_counts(state, "counts", 2)
+        self._mapped_frames, self.count = get_counts(state, "counts", 2)
 
     def _limit_for(self, keyframe: Keyframe) -> None:
         """Reduce the limits if this image is the largest so far."""
@@ -235,9 +231,6 @@ class KeyframeStore:
     def _ids(self) -> list[FrameId]:
         """Return every kept frame once, the buffer's first."""
         return list(dict.fromkeys([*self._buffer, *self._recent, *self._long_term]))
-
-    def _capture_time_ns(self, frame: FrameId) -> int:
-        return self._keyframes[frame].frame.capture_time_ns
 
     def _newest_first(self) -> Iterator[Keyframe]:
         """Yield the window's keyframes, then the buffer's, each the newest first."""

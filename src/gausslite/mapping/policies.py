@@ -47,16 +47,6 @@ PAPER_FLAGS, EXTENSION_FLAGS = ABLATION_FLAGS[:5], ABLATION_FLAGS[5:]
 """The paper's components (Sec. III-C, III-D) in the order of its ablation (Table III), and the extensions."""
 
 
-def uniform_policy() -> MapperSettings:
-    """Return uniform seeding and full-image training with this engine's density control."""
-    return MapperSettings(components=NO_TASK)
-
-
-def task_policy() -> MapperSettings:
-    """Return the default policy: the paper's five components and the extensions of EXTENSION_FLAGS."""
-    return MapperSettings()
-
-
 def paper_policy() -> MapperSettings:
     """Return the method as published. Where the paper gives no value, Gaussian-SLAM's or SplaTAM's release does.
 
@@ -83,7 +73,11 @@ def paper_policy() -> MapperSettings:
     return disable(published, EXTENSION_FLAGS)
 
 
-_CORE: dict[str, Callable[[], MapperSettings]] = {TASK: task_policy, "paper": paper_policy, UNIFORM: uniform_policy}
+_CORE: dict[str, Callable[[], MapperSettings]] = {
+    TASK: MapperSettings,  # the paper's five components and the extensions of EXTENSION_FLAGS
+    "paper": paper_policy,
+    UNIFORM: lambda: MapperSettings(components=NO_TASK),  # seeds and trains whole images, with the same density control
+}
 POLICIES = (*_CORE, *names(Group.POLICIES))
 """All names; those of packages are the baselines of comparisons."""
 
@@ -94,11 +88,6 @@ def policy(name: str) -> MapperSettings:
         raise InvalidInputError(f"policy: expected one of {', '.join(POLICIES)}, got {name!r}")
     settings: MapperSettings = _CORE[name]() if name in _CORE else load(Group.POLICIES, name)
     return settings
-
-
-def follows_task(name: str) -> bool:
-    """True if the map of a named policy depends on the task. Raises InvalidInputError."""
-    return policy(name).components.follow_task
 
 
 def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32, Int64, UInt32
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.errors import InvalidInputError, MapFileError, QuotaError
@@ -38,6 +40,7 @@ _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "roi_evidence": (None, np.int16),
     "anchor": (None, np.int32),
 }
+"""Width (None: a vector) and type of each column of the table and of its saved state."""
 NO_ANCHOR = -1
 """Anchor of Gaussians that follow no keyframe: those of an initial map and of teammates."""
 _MAX_LOG_SCALE = 80.0
@@ -46,8 +49,9 @@ _MAX_MOMENT_RATIO, _MOMENT_TOLERANCE = 1e6, 1e-30
 """Bounds of (first moment)² against the second. By the Cauchy-Schwarz inequality their ratio is at most
 (1 - b1)² / ((1 - b2) (1 - b1² / b2)): 53 for Adam's usual betas. The margin allows other betas; the tolerance, second
 moments that float32 rounds to 0."""
-_BYTES_PER_GAUSSIAN = 274
+_BYTES_PER_GAUSSIAN = sum((width or 1) * np.dtype(dtype).itemsize for width, dtype in _COLUMNS.values())
 _ROWS_IN_CACHE = 4096
+"""Rows that an update of the EMA reads at once: with their averages 512 KiB, which a core's cache holds."""
 _MIN_UPDATES_PER_HORIZON = 8.0
 """The EMA horizon of a row is at most its number of updates divided by this."""
 
@@ -66,90 +70,72 @@ def _too_large(capacity: int) -> InvalidInputError:
 class SplatTable:
     """Encoded parameters of the Gaussians, their EMA, Adam's two moments and per-Gaussian columns (Sec. III-A).
 
-    `count` never exceeds `capacity`, the cap (`max-gaussians`). All arrays are views of the first `count` rows;
-    `append`, `append_rows` and `keep` invalidate earlier views.
+    `count`, the number of Gaussians, never exceeds `capacity`, the cap (`max-gaussians`). All arrays are views of the
+    first `count` rows; `append`, `append_rows` and `keep` invalidate earlier views.
     """
 
     def __init__(self, capacity: int) -> None:
         """Allocate an empty table. Raises InvalidInputError if capacity is below 1 or exceeds the memory."""
         if capacity < 1:
             raise InvalidInputError(f"table capacity: expected at least 1 Gaussian, got {capacity}")
-        self._capacity = capacity
-        self._count = 0
+        self.capacity, self.count = capacity, 0
         try:
-            self._rows, self._first_moment, self._second_moment = (allocate_rows(capacity) for _ in range(3))
-            self._ema_rows = allocate_rows(capacity)
-            self._active = np.zeros(capacity, np.bool_)
-            self._kappa = np.zeros(capacity, np.uint32)
-            self._target = np.zeros(capacity, np.int16)
-            self._roi_evidence = np.zeros(capacity, np.int16)
-            self._anchor = np.zeros(capacity, np.int32)
+            self._columns: dict[str, NDArray[Any]] = {
+                name: np.zeros(capacity, dtype) if width is None else allocate_rows(capacity)
+                for name, (width, dtype) in _COLUMNS.items()
+            }
         except (OSError, MemoryError, OverflowError, ValueError):
             raise _too_large(capacity) from None
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def capacity(self) -> int:
-        """Maximum number of Gaussians."""
-        return self._capacity
-
-    @property
-    def count(self) -> int:
-        """Current number of Gaussians."""
-        return self._count
 
     @property
     def free_slots(self) -> int:
         """Number of Gaussians that still fit."""
-        return self._capacity - self._count
-
-    @property
-    def table_bytes(self) -> int:
-        """Memory allocated for everything but the optimiser state."""
-        columns = (self._active, self._kappa, self._target, self._roi_evidence, self._anchor)
-        return self._rows.nbytes + self._ema_rows.nbytes + sum(column.nbytes for column in columns)
+        return self.capacity - self.count
 
     @property
     def optimizer_bytes(self) -> int:
         """Memory allocated for Adam's two moments."""
-        return self._first_moment.nbytes + self._second_moment.nbytes
+        return self._columns["first_moment"].nbytes + self._columns["second_moment"].nbytes
+
+    @property
+    def table_bytes(self) -> int:
+        """Memory allocated for everything but the optimiser state."""
+        return sum(column.nbytes for column in self._columns.values()) - self.optimizer_bytes
 
     @property
     def rows(self) -> Float32[ndarray, "n 16"]:
         """Encoded parameters, in the layout of `render.rasterizer`."""
-        return self._rows[: self._count]
+        return self._columns["rows"][: self.count]
 
     @property
     def first_moment(self) -> Float32[ndarray, "n 16"]:
         """Adam's first moment; its columns 14 and 15 hold the density statistics."""
-        return self._first_moment[: self._count]
+        return self._columns["first_moment"][: self.count]
 
     @property
     def second_moment(self) -> Float32[ndarray, "n 16"]:
         """Adam's second moment."""
-        return self._second_moment[: self._count]
+        return self._columns["second_moment"][: self.count]
 
     @property
     def ema_rows(self) -> Float32[ndarray, "n 16"]:
         """Exponential moving average (EMA) of the rows at the last `update_ema`; of a new Gaussian, its row."""
-        return self._ema_rows[: self._count]
+        return self._columns["ema_rows"][: self.count]
 
     @property
     def active(self) -> Bool[ndarray, " n"]:
         """The paper's flag a: seeded inside the region of interest (ROI), or inside it after a task change."""
-        return self._active[: self._count]
+        return self._columns["active"][: self.count]
 
     @property
     def kappa(self) -> UInt32[ndarray, " n"]:
         """Steps of the active phase that trained each Gaussian; an iteration has up to `active_views` steps."""
-        return self._kappa[: self._count]
+        return self._columns["kappa"][: self.count]
 
     @property
     def target(self) -> Int16[ndarray, " n"]:
         """Index into TaskGraph.targets, -1 for none."""
-        return self._target[: self._count]
+        return self._columns["target"][: self.count]
 
     @property
     def roi_evidence(self) -> Int16[ndarray, " n"]:
@@ -157,12 +143,12 @@ class SplatTable:
 
         A new Gaussian starts at 1 if active, else at -1.
         """
-        return self._roi_evidence[: self._count]
+        return self._columns["roi_evidence"][: self.count]
 
     @property
     def anchor(self) -> Int32[ndarray, " n"]:
         """Number of the keyframe that each Gaussian follows when poses are corrected; NO_ANCHOR for none."""
-        return self._anchor[: self._count]
+        return self._columns["anchor"][: self.count]
 
     @property
     def means_m(self) -> Float32[ndarray, "n 3"]:
@@ -176,6 +162,7 @@ class SplatTable:
 
     def has_lower_opacity(self, opacity: float) -> Bool[ndarray, " n"]:
         """Return True for each Gaussian whose opacity is lower than this value in (0, 1)."""
+        # in logits, so that no row is decoded
         return self.rows[:, OPACITY_LOGIT] < math.log(opacity) - math.log1p(-opacity)
 
     def most_transparent(self, ids: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:
@@ -217,45 +204,45 @@ class SplatTable:
         """Add encoded rows with zero optimiser state. Raises QuotaError if they do not fit."""
         if len(rows) > self.free_slots:
             raise QuotaError(f"table: expected at most {self.free_slots} more Gaussians, got {len(rows)}")
-        place = slice(self._count, self._count + len(rows))
+        place = slice(self.count, self.count + len(rows))
         self._put(place, rows, active, kappa, target)
-        self._anchor[place] = anchor
-        self._count += len(rows)
+        self._columns["anchor"][place] = anchor
+        self.count += len(rows)
 
     def replace(self, ids: Int[ndarray, " m"], gaussians: Gaussians, anchor: int = NO_ANCHOR) -> None:
         """Overwrite the Gaussians `ids` with these, with zero optimiser state."""
         self._put(ids, gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
-        self._anchor[ids] = anchor
+        self._columns["anchor"][ids] = anchor
 
     def keep(self, mask: Bool[ndarray, " n"]) -> None:
         """Remove the Gaussians where mask is False; the others keep their optimiser state.
 
         The last Gaussians, in their order, move to the rows of the removed ones, so that few rows move.
         """
-        require_array("keep mask", mask, (self._count,), np.bool_)
+        require_array("keep mask", mask, (self.count,), np.bool_)
         kept = int(np.count_nonzero(mask))
+        # the gaps among the first `kept` rows are as many as the kept rows after them
         vacant, moved = np.flatnonzero(~mask[:kept]), kept + np.flatnonzero(mask[kept:])
-        for name in _COLUMNS:
-            column = getattr(self, f"_{name}")
+        for column in self._columns.values():
             column[vacant] = column[moved]
-        self._count = kept
+        self.count = kept
 
     def remove(self, rows: Int[ndarray, " m"]) -> None:
         """Remove the Gaussians of these rows."""
         if len(rows):
-            mask = np.ones(self._count, np.bool_)
+            mask = np.ones(self.count, np.bool_)
             mask[rows] = False
             self.keep(mask)
 
     def state(self) -> State:
         """Return all columns, as views."""
-        return {name: getattr(self, name) for name in _COLUMNS}
+        return {name: column[: self.count] for name, column in self._columns.items()}
 
     def restore(self, state: State) -> None:
         """Replace the contents by a saved state. Raises QuotaError if it does not fit, MapFileError, ShapeError."""
         rows = get_array(state, "rows", (None, ROW_WIDTH), np.float32)
-        if len(rows) > self._capacity:
-            raise QuotaError(f"max_gaussians: expected at least the {len(rows)} saved ones, got {self._capacity}")
+        if len(rows) > self.capacity:
+            raise QuotaError(f"max_gaussians: expected at least the {len(rows)} saved ones, got {self.capacity}")
         columns = {
             name: get_array(state, name, (len(rows),) if width is None else (len(rows), width), dtype)
             for name, (width, dtype) in _COLUMNS.items()
@@ -265,8 +252,8 @@ class SplatTable:
         if not _is_reachable(columns):
             raise MapFileError("state table: expected scales, EMA and moments that training can produce, got others")
         for name, column in columns.items():
-            getattr(self, f"_{name}")[: len(rows)] = column
-        self._count = len(rows)
+            self._columns[name][: len(rows)] = column
+        self.count = len(rows)
 
     def update_ema(self, horizon_updates: float) -> None:
         """Advance the EMA of all rows that changed since the last call.
@@ -278,6 +265,7 @@ class SplatTable:
         for start in range(0, len(changed), _ROWS_IN_CACHE):
             ids = changed[start : start + _ROWS_IN_CACHE]
             rows, ema = self.rows.take(ids, axis=0), self.ema_rows.take(ids, axis=0)
+            # a row of n updates since the last call moves by 1 - exp(-n / horizon): calls may come at any interval
             horizon = np.minimum(np.float32(horizon_updates), rows[:, UPDATE_COUNT] / _MIN_UPDATES_PER_HORIZON)
             weight = -np.expm1((ema[:, UPDATE_COUNT] - rows[:, UPDATE_COUNT]) / horizon)
             ema += weight[:, None] * (rows - ema)
@@ -286,7 +274,7 @@ class SplatTable:
 
     def to_gaussians(self, ids: Int[ndarray, " m"] | None = None, use_ema: bool = False) -> Gaussians:
         """Return copies of all Gaussians, or of these ids, as physical values; use_ema: of the EMA rows."""
-        chosen = np.arange(self._count) if ids is None else ids
+        chosen = np.arange(self.count) if ids is None else ids
         columns = self.ema_rows if use_ema else self.rows, self.active, self.kappa, self.target
         return rows_to_gaussians(*(column.take(chosen, axis=0) for column in columns))
 
@@ -299,12 +287,11 @@ class SplatTable:
         target: Int16[ndarray, " m"],
     ) -> None:
         """Write new Gaussians, with zero optimiser state."""
-        self._rows[place] = rows
-        self._ema_rows[place] = rows
-        self._first_moment[place] = 0.0
-        self._second_moment[place] = 0.0
-        self._active[place], self._kappa[place], self._target[place] = active, kappa, target
-        self._roi_evidence[place] = np.where(active, 1, -1)
+        columns = {"rows": rows, "ema_rows": rows, "active": active, "kappa": kappa, "target": target}
+        for name, values in columns.items():
+            self._columns[name][place] = values
+        self._columns["first_moment"][place] = self._columns["second_moment"][place] = 0.0
+        self._columns["roi_evidence"][place] = np.where(active, 1, -1)
 
 
 def _is_reachable(columns: State) -> bool:

@@ -55,19 +55,15 @@ class StageScheduler(Protocol):
 
     def timing(self, stage: Stage) -> AbstractContextManager[None]:
         """Return a context that surrounds one execution of the stage."""
-        ...
 
     def skips(self, stage: SkippableStage) -> bool:
         """Return True if the current frame skips this stage."""
-        ...
 
     def has_time_for(self, stage: Stage) -> bool:
         """Return True if the frame is expected to meet its deadline with this optional stage."""
-        ...
 
     def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
         """Return True if another iteration of this stage should run."""
-        ...
 
 
 class CountedScheduler:

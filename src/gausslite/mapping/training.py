@@ -147,11 +147,6 @@ class Trainer:
         self._since_prune = 0
         self._since_densify = 0
 
-    @property
-    def iterations(self) -> int:
-        """Iterations of the whole mission."""
-        return self._iterations
-
     def state(self) -> State:
         """Return the iteration counts, the measured saturation and the visited views: all state between two frames."""
         return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Int64, UInt64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
@@ -35,7 +35,9 @@ class SentVoxelTracker:
         active = gaussians if gaussians.active.all() else gaussians.take(gaussians.active)
         voxels = VoxelIndex.from_points(active.means_m, self._grid)
         signatures = VoxelSignatures.from_gaussians(active, voxels)
-        selected = self._may_replace(signatures)  # the server keeps what an earlier task trained better
+        selected = self._may_replace(
+            signatures.keys, signatures.kappa_sums
+        )  # the server keeps what an earlier task trained better
         current = signatures.select(selected)
         changed = np.zeros(len(signatures.keys), np.bool_)
         changed[selected], removed = self._tracker.update(current, retained=self._frozen)
@@ -54,6 +56,7 @@ class SentVoxelTracker:
 
         A voxel is sent only after this agent's training has raised its Σkappa by a quarter.
         """
+        # a signature whose number and hash no content has: the voxel counts as changed when its Σkappa suffices
         values = np.zeros((len(received), 3), np.uint64)
         values[:, 0] = received.kappa_sums + received.kappa_sums // np.uint64(4) + np.uint64(1)
         self._tracker.insert(VoxelSignatures(received.keys, values))
@@ -61,9 +64,7 @@ class SentVoxelTracker:
 
     def exclude_frozen(self, batch: VoxelBatch) -> VoxelBatch:
         """Return the batch without the voxels that are frozen with a higher Σkappa."""
-        values = np.zeros((len(batch), 3), np.uint64)
-        values[:, 0] = batch.kappa_sums
-        return select_voxels(batch, self._may_replace(VoxelSignatures(batch.keys, values)))
+        return select_voxels(batch, self._may_replace(batch.keys, batch.kappa_sums))
 
     def add_tombstones(self, batch: VoxelBatch, stored: Int64[ndarray, " s"]) -> VoxelBatch:
         """Return the batch, with a tombstone for each stored voxel that is neither in the batch nor frozen."""
@@ -79,15 +80,11 @@ class SentVoxelTracker:
         keys = self._tracker.signatures.keys
         self._frozen = keys[get_array(state, "frozen", (len(keys),), np.bool_)]
 
-    def _may_replace(self, candidates: VoxelSignatures) -> Bool[ndarray, " v"]:
+    def _may_replace(self, keys: Int64[ndarray, " v"], kappa_sums: UInt64[ndarray, " v"]) -> Bool[ndarray, " v"]:
         """True for voxels that are not frozen, or frozen with a Σkappa that is not higher."""
-        if len(self._frozen) == 0:
-            return np.ones(len(candidates.keys), np.bool_)
         sent = self._tracker.signatures
         frozen = sent.select(np.isin(sent.keys, self._frozen, assume_unique=True))
-        place = np.minimum(np.searchsorted(frozen.keys, candidates.keys), len(frozen.keys) - 1)
-        is_other = frozen.keys[place] != candidates.keys
-        allowed: Bool[ndarray, " v"] = is_other | (candidates.kappa_sums >= frozen.kappa_sums[place])
+        allowed: Bool[ndarray, " v"] = kappa_sums >= _lookup(frozen.keys, frozen.kappa_sums, keys)
         return allowed
 
 

@@ -133,7 +133,6 @@ class RememberingDetector(Detector, Protocol):
 
     def remember(self, estimator: RelevanceEstimator, /) -> RelevanceEstimator:
         """Return an estimator that reports these objects after its own, and has them in its state."""
-        ...
 
 
 OpenMemory = Callable[[Detector, UpAxis], RememberingDetector]

@@ -41,14 +41,11 @@ class Evaluator(Protocol):
 
     def training_fit(self, viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]) -> TrainingFit:
         """Return how well the map fits keyframes that it was trained on."""
-        ...
 
     def preview(
         self, viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
     ) -> UInt8[ndarray, "H W 3"]:
         """Return a picture of some keyframes beside the map's rendering."""
-        ...
 
     def trajectory_error(self, estimated: Trajectory, reference: Trajectory) -> TrajectoryError | None:
         """Return the error of a trajectory; None with too few poses at times of the reference."""
-        ...

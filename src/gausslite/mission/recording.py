@@ -15,8 +15,9 @@ from gausslite.config.values import (
     CORRECTION_FORM,
     NONE,
     PRIOR_FORM,
-    read_correction_or_auto,
-    read_prior_or_auto,
+    or_auto,
+    read_correction,
+    read_prior,
     read_registration_or_auto,
     write_correction,
     write_prior,
@@ -58,7 +59,7 @@ class RecordingOptions:
         "(default: auto, none for simulated homes, or what the report next to a map states)",
         metavar=f"{AUTO}|{NONE}|{CORRECTION_FORM}",
         plain_type=str,
-        convert=read_correction_or_auto,
+        convert=or_auto(read_correction),
         to_plain=write_correction,
     )
     pose_prior: PoseExposurePrior | str = option(
@@ -66,7 +67,7 @@ class RecordingOptions:
         f"{POSE_PRIOR_HELP}; auto: estimated from pairs of frames",
         metavar=f"{AUTO}|{NONE}|{PRIOR_FORM}",
         plain_type=str,
-        convert=read_prior_or_auto,
+        convert=or_auto(read_prior),
         to_plain=write_prior,
     )
 

@@ -18,11 +18,9 @@ class RunRecord(Protocol):
 
     def add(self, outcome: FrameOutcome, poses: PoseTable, gaussians: Callable[[], Gaussians], /) -> None:
         """Take what the file needs of a processed frame. gaussians: returns the map."""
-        ...
 
     def write(self, folder: Path, keyframes: Sequence[Keyframe], /) -> None:
         """Write the file after the last frame. keyframes: oldest first. Raises StorageError."""
-        ...
 
 
 class RunRecords:

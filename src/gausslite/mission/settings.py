@@ -28,7 +28,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.recording import TRACKED_PRIOR, CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
-from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, follows_task, policy
+from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.perception.detector_file import MAX_TILES_PER_SIDE
@@ -241,8 +241,7 @@ def _iterations_of_policy(options: object) -> int | None:
     """Return the iterations per frame of the chosen policy; None at a rate."""
     if getattr(options, "rate", None) is not None:
         return None
-    settings = policy(getattr(options, "policy", None) or TASK).optimization
-    return settings.warmup_iterations + settings.active_iterations
+    return policy(getattr(options, "policy", None) or TASK).optimization.iterations
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,7 +316,7 @@ class MissionSettings:
     @property
     def follows_task(self) -> bool:
         """True if the policy's map depends on a task or on regions."""
-        return follows_task(self.policy)
+        return policy(self.policy).components.follow_task
 
     @property
     def scheduler_settings(self) -> SchedulerSettings | None:

@@ -21,11 +21,9 @@ class Detector(Protocol):
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return all instances of each query, best first; one object may match several queries."""
-        ...
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return what this detector searches for each query."""
-        ...
 
 
 def bounding_box(mask: Bool[ndarray, "h w"]) -> tuple[float, float, float, float] | None:

@@ -42,11 +42,9 @@ class DetectorReader(Protocol):
 
         Raises ModelFileError if it is of this kind and damaged, InvalidInputError if the options do not fit it.
         """
-        ...
 
     def advice(self) -> str:
         """Return how a user without a file gets one, in one line."""
-        ...
 
 
 def open_detector(path: Path, options: DetectorOptions) -> Detector:

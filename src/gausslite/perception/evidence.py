@@ -18,11 +18,11 @@ from gausslite.perception.object_map import Landmark
 from gausslite.perception.settings import EvidenceSettings
 
 _MIN_SEEN_KNOWN = 3
-"""Detections after which a landmark is known. After two with high scores, chairs' precision is 0.42 (0.48)."""
+"""Detections after which a landmark is known. After two of high score, precision of chairs is 0.42 instead of 0.48."""
 _CERTAIN_SCORE = 0.9
-"""Of ground truth, and of few detections: the best one of a ghost in the kitchen has 0.75."""
+"""Score from which one detection alone counts: the best one of a thing that does not exist had 0.75 in the kitchen."""
 _WEAK_SHARE = 0.5
-"""Weight of a weak detection among them: recall of a rarely found monitor 0.40 to 0.87."""
+"""Weight of a weak detection among them: it raises the recall of a rarely found monitor from 0.40 to 0.87."""
 _MIN_PRESENT_FRACTION = 0.5
 """Share of its frames that found a landmark, from which it is still there if the latest one misses it. With 1, the
 recall of monitors is 0.42 instead of 0.50; with 0.33, the precision of sofas 0.90 instead of 0.91."""
@@ -33,8 +33,8 @@ _MIN_VISIBLE_SHARE = 0.6
 """Share of a landmark's cells that a frame shows that should detect it."""
 _MAX_DISTANCE_RATIO = 1.1
 """Distance, relative to the farthest detection, up to which a frame should detect it."""
-
 _NEAR_M = 0.05
+"""Least depth that is projected; nearer points have no pixel."""
 
 
 class LandmarkState(StrEnum):
@@ -72,7 +72,7 @@ class Evidence:
     def confirmed(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
         """Return the landmarks that are confirmed or known, without those in whose place another thing is surer."""
         found = [landmark for landmark in landmarks if self.state(landmark) is not LandmarkState.CANDIDATE]
-        return [landmark for landmark in found if not any(_is_rather(other, landmark) for other in found)]
+        return [landmark for landmark in found if not any(_is_better_explained(other, landmark) for other in found)]
 
     def rival(self, landmark: Landmark) -> str | None:
         """Return the different thing that the landmark rather is by the sums of the scores; None if there is none."""
@@ -88,6 +88,7 @@ class Evidence:
 
     def without_low_scores(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
         """Return the landmarks whose confidence is not far below the best of their noun."""
+        # ascending, so that the best confidence of each noun is the last one that the dictionary keeps
         best = dict(sorted((found.phrase, found.confidence) for found in landmarks if not found.is_given))
         least = self.settings.min_score_share
         return [found for found in landmarks if found.confidence >= least * best.get(found.phrase, 0.0)]
@@ -99,7 +100,7 @@ class Evidence:
         return landmark.is_given or landmark.missed_in_a_row == 0 or is_often_found
 
 
-def _is_rather(other: Landmark, landmark: Landmark) -> bool:
+def _is_better_explained(other: Landmark, landmark: Landmark) -> bool:
     """Return True if a landmark's place shows an object of another kind with more confidence."""
     return (
         other.phrase != landmark.phrase

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, ObjectRole
-from gausslite.domain.relevance import Rival
+from gausslite.domain.relevance import CompetingClass
 from gausslite.domain.state import State
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.perception.surface import SurfaceVotes
@@ -43,11 +43,9 @@ class Measured(Protocol):
 
     def add(self, other: Self) -> Self:
         """Return the attributes over the observations of both."""
-        ...
 
     def state(self) -> State:
         """Return the attributes as named arrays."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +64,7 @@ class Observation:
     camera_m: Float64[ndarray, "3"] | None = None
     score: float = 1.0
     time_ns: int = 0
-    rival: Rival | None = None  # a different thing detected in the same place
+    rival: CompetingClass | None = None  # a different thing detected in the same place
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     is_weak: bool = False  # of a weak detection
     measured: Measured | None = None  # attributes that the mask shows
@@ -237,6 +235,7 @@ class Landmark:
             self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
 
     def _add_cells(self, other: Landmark) -> None:
+        # a cell counts the frames that showed it: background inside a mask is not seen from other sides
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
         if len(merged) > _MAX_CELLS:
@@ -307,6 +306,7 @@ class ObjectMap:
 
         With is_visible, the other landmarks that the frame should have shown are counted as missed.
         """
+        # exact masks first: a weak detection only counts for what none of them shows
         observed = [self._add(observation) for observation in observations if not observation.is_weak]
         for observation in observations:
             if observation.is_weak:

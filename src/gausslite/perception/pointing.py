@@ -26,15 +26,12 @@ class Pointing(Protocol):
         boxes_px: Sequence[tuple[float, float, float, float]] = (),
     ) -> Region:
         """Return the region of points (x, y) and boxes (left, top, right, bottom) on one frame, as one object."""
-        ...
 
     def region_at(self, point_m: PointM, frames: Iterable[Frame]) -> Region:
         """Return the object at a point in the world, on the frame that shows the point best."""
-        ...
 
     def pointed_masks(self, pointed: Iterable[PointedObject], keyframes: Sequence[Frame]) -> list[PointedMask]:
         """Return the mask of each object pointed at; keyframes: oldest first."""
-        ...
 
 
 def pointing() -> Pointing:

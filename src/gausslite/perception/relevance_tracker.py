@@ -223,6 +223,7 @@ class RelevanceTracker:
         """Return the masks of all targets. A detected mask adds pixels that no other frame shows outside its object."""
         masks = []
         for landmark, name in self._targets.select(self._viewpoint(frame)):
+            # once known, always: earlier keyframes have its mask by now
             if landmark.number not in self._known_targets and self._evidence.state(landmark) is LandmarkState.KNOWN:
                 self._known_targets.append(landmark.number)
             own = [mask for owner, mask in detected if owner is landmark]
@@ -247,6 +248,7 @@ class RelevanceTracker:
         localised = self._measured(lift_detections(kept, depth_m, frame, self._up), frame)
         self._selector.observe(frame)  # before relations are evaluated: a selector may need the image
         visibility = VisibilityCheck(frame, frame.depth_m)
+        # what this frame should show and does not is counted too: a ghost disappears by that
         self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
         shown = [
             (landmark, detection.mask, observation)

@@ -40,15 +40,12 @@ class TaskObjects(Protocol):
 
     def seen(self, name: str) -> list[Landmark]:
         """Return all landmarks of a name."""
-        ...
 
     def confirmed(self, name: str) -> list[Landmark]:
         """Return the confirmed landmarks of a name; if there are none, all of them."""
-        ...
 
     def candidates(self, name: str) -> list[Landmark]:
         """Return those of which one can be the closest or the farthest."""
-        ...
 
 
 class Selector:

@@ -84,7 +84,7 @@ def _parts(keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
     part = np.arange(len(keys))
     while True:
         spread = part[rows].min(axis=1)
-        spread = spread[spread]
+        spread = spread[spread]  # a cell also takes what its smallest row has found: far fewer rounds
         if np.array_equal(spread, part):
             return np.unique(part, return_inverse=True)[1]
         part = spread
@@ -138,7 +138,7 @@ class SurfaceVotes:
     def add(self, other: SurfaceVotes) -> SurfaceVotes:
         """Return the sums of both votes, in the coarser grid of both."""
         voxel_m = max(self.voxel_m, other.voxel_m)
-        both = [votes.coarsened(voxel_m) for votes in (self, other)]
+        both = [votes.coarsened(voxel_m) for votes in (self, other)]  # votes of a finer grid cannot be divided
         keys = np.concatenate([votes.keys for votes in both])
         inside = np.concatenate([votes.inside for votes in both])
         outside = np.concatenate([votes.outside for votes in both])
@@ -244,9 +244,11 @@ class SurfaceVotes:
         points_m = self.surface_m.astype(np.float64)
         if len(points_m) < _MIN_BOX_VOXELS:
             return None
+        # masks show a strip of the plane around the object: without it the rest has the object's sides
         around_m = self._grid.centres_m(self._outside_keys).astype(np.float64)
         own_m = points_m[is_off_planes(points_m, _PLANE_SLACK_M, around_m, _PLANE_SLACK_M)]
         low_m, high_m = np.percentile(own_m, _BOX_PERCENTILES, axis=0)
+        # back on all points: what of the object lies in the plane, such as its base, belongs to it
         is_near = ((points_m >= low_m - _PLANE_SLACK_M) & (points_m <= high_m + _PLANE_SLACK_M)).all(axis=1)
         low_m, high_m = np.percentile(points_m[is_near], _BOX_PERCENTILES, axis=0)
         return AxisAlignedBox.around(np.stack([low_m - 0.5 * self.voxel_m, high_m + 0.5 * self.voxel_m]))
@@ -282,9 +284,10 @@ def _planes(points_m: Float64[ndarray, "n 3"], limits_m: _Limits) -> list[Float6
     step = max(1, len(points_m) // _MAX_PLANE_POINTS)
     points_m, near_m = points_m[::step], np.broadcast_to(limits_m, len(points_m))[::step]
     min_points = max(_MIN_PLANE_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # its own: the same surface always has the same box
     planes: list[Float64[ndarray, "4"]] = []
     while len(planes) < _MAX_PLANES and len(points_m) >= min_points:
+        # RANSAC (Fischler and Bolles 1981), all triples at once
         corners = points_m[rng.integers(len(points_m), size=(_PLANE_SAMPLES, 3))]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -329,7 +332,10 @@ def _guided_filter(
     values: Float32[ndarray, "h w"],
     wanted: Bool[ndarray, "h w"],
 ) -> Float32[ndarray, "h w"]:
-    """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels."""
+    """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels.
+
+    The guided filter (He et al., ECCV 2010) with a colour image as the guide.
+    """
     window = _EDGE_WINDOW
     guide_mean, value_mean = cv2.blur(guide, window), cv2.blur(values, window)
     products = cv2.blur(guide * values[..., None], window) - guide_mean * value_mean[..., None]

@@ -22,15 +22,12 @@ class Backend(Protocol):
     @property
     def needs(self) -> str:
         """What it needs of the machine, as in "driver, torch and gsplat"."""
-        ...
 
     def obstacle(self) -> str | None:
         """Return why it cannot run here, without loading large packages; None if `create` may be tried."""
-        ...
 
     def create(self, threads: int | None, /) -> Rasterizer:
         """Create the rasterizer. threads: None means as many as it wants. Raises KernelError."""
-        ...
 
 
 def backends() -> tuple[str, ...]:

@@ -268,10 +268,10 @@ class CpuRasterizer:
     """
 
     def __init__(self, threads: int | None = None, simd: str | None = None) -> None:
-        self._simd = choose_simd(simd)
+        self.simd = choose_simd(simd)
         count = choose_threads(threads)
         try:
-            self._engine: _kernels.Engine = load_kernels().Engine(self._simd, count)
+            self._engine: _kernels.Engine = load_kernels().Engine(self.simd, count)
         except RuntimeError as reason:
             raise KernelError(f"threads: expected a number that can be started, got {count} ({reason})") from reason
         self._lock = RLock()
@@ -282,11 +282,6 @@ class CpuRasterizer:
     def name(self) -> str:
         """`cpu`."""
         return "cpu"
-
-    @property
-    def simd(self) -> str:
-        """Name of the instruction set in use."""
-        return self._simd
 
     @property
     def threads(self) -> int:

@@ -200,7 +200,6 @@ class TrainingView(Protocol):
     @property
     def camera(self) -> Camera:
         """Intrinsics of the image."""
-        ...
 
 
 @runtime_checkable
@@ -210,12 +209,10 @@ class StepReport(Protocol):
     @property
     def loss(self) -> float:
         """The loss before the update."""
-        ...
 
     @property
     def visible(self) -> UInt32[ndarray, " m"]:
         """The visible rows, ascending, trainable or not."""
-        ...
 
 
 @runtime_checkable
@@ -225,7 +222,6 @@ class Rasterizer(Protocol):
     @property
     def name(self) -> str:
         """The value of the option `rasterizer`, such as `cpu`."""
-        ...
 
     def forward(
         self,
@@ -239,7 +235,6 @@ class Rasterizer(Protocol):
 
         Raises ShapeError, InvalidInputError if the ids are not ascending row numbers.
         """
-        ...
 
     def backward(
         self,
@@ -252,7 +247,6 @@ class Rasterizer(Protocol):
 
         Raises ShapeError, InvalidInputError if the rendering is not this backend's or no longer valid.
         """
-        ...
 
     def prepare_view(
         self,
@@ -269,7 +263,6 @@ class Rasterizer(Protocol):
         `masked=True`; default 1. dilation_px2: of the steps' renderings, in (0, 1).
         Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
         """
-        ...
 
     def step(
         self,
@@ -291,7 +284,6 @@ class Rasterizer(Protocol):
         statistics and update_counter change for the same rows. masked=True weights the loss by the view's weight.
         Raises ShapeError, InvalidInputError.
         """
-        ...
 
     def bind_tables(
         self,
@@ -305,7 +297,6 @@ class Rasterizer(Protocol):
         writes the tables and update counters back on exit, also after an exception. Without a binding, each step
         copies the tables to the device and back. Raises ShapeError, InvalidInputError if tables are bound already.
         """
-        ...
 
 
 def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = None) -> None:

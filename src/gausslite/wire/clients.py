@@ -220,7 +220,7 @@ class FusionClient(ServiceChannel):
         request = pb.JoinSessionRequest(
             agent_id=agent_id,
             mission_id=self.mission_id,
-            grid=convert.grid_to_message(grid),
+            grid=geometry_pb2.VoxelGrid(size_m=grid.size_m),
             world_frame=world_frame,
             fresh_map=fresh_map,
             task=None if task is None else convert_task.graph_to_message(task),

@@ -310,16 +310,6 @@ def pose_of_encoded_frame(data: bytes) -> Float64[ndarray, "4 4"]:
     return transform_from_message("keyframe t_world_camera", message.t_world_camera)
 
 
-def grid_to_message(grid: VoxelGrid) -> geometry_pb2.VoxelGrid:
-    """Encode a voxel grid."""
-    return geometry_pb2.VoxelGrid(size_m=grid.size_m)
-
-
-def grid_from_message(message: geometry_pb2.VoxelGrid) -> VoxelGrid:
-    """Decode a voxel grid. Raises InvalidInputError."""
-    return VoxelGrid(message.size_m)
-
-
 def box_to_message(box: AxisAlignedBox) -> geometry_pb2.Box:
     """Encode a box."""
     return geometry_pb2.Box(min_m=point_to_message(box.min_m), max_m=point_to_message(box.max_m))

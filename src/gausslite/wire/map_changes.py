@@ -34,11 +34,9 @@ class MapReader(Protocol):
 
     def snapshot(self) -> tuple[int, Parts]:
         """Return a revision and the whole map, encoded when it is read: newer than the revision, never older."""
-        ...
 
     def changes(self, since_revision: int) -> tuple[int, Parts]:
         """Return a revision and what changed up to it. Raises RevisionGoneError."""
-        ...
 
 
 def map_blocks(reader: MapReader, since_revision: int) -> Iterator[MapBlock]:

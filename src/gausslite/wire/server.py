@@ -29,8 +29,8 @@ from gausslite.wire.channel import KEEPALIVE_S, UNIX, connection_options, host_a
 from gausslite.wire.status import code_and_reason, to_status
 
 _log = logging.getLogger(__name__)
-_CHECK_S = 30.0
-_RETRY_S = 1.0
+_CHECK_S, _RETRY_S = 30.0, 1.0
+"""Between two checks of a service that works, and of one that does not."""
 _CHECK_LIMIT_S = 5.0
 """A check that takes longer has failed: it waits for the same disk as the calls."""
 LIVENESS = "liveness"
@@ -38,6 +38,7 @@ LIVENESS = "liveness"
 Check = Callable[[], None]
 """Raises GaussLiteError while the service cannot work."""
 _LAST_CALLS_S = 1.0
+"""For cancelled calls to end."""
 _HEALTH_LIMITS = call_limits.CallLimits(connections=64, idle_s=10)
 # the longest path of a unix socket that Linux accepts
 _MAX_SOCKET_PATH_BYTES = 107

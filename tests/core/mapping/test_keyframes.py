@@ -12,7 +12,7 @@ from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.keyframe_store import KeyframeStore, motion_blur_px
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.policies import uniform_policy
+from gausslite.mapping.policies import UNIFORM, policy
 from gausslite.mapping.settings import Components, KeyframeSettings
 from gausslite.mapping.window_view import tiles_touching, window_view
 from gausslite.render.cpu import CpuRasterizer
@@ -121,7 +121,7 @@ def test_a_policy_without_a_task_keeps_as_many_views() -> None:
     assert kept == [view.keyframe.frame.index for view in stored(settings, 40).window]
     store.replace(store.window[0].keyframe, lambda keyframe: window_view(keyframe, rasterizer, settings))
     assert [view.keyframe.frame.index for view in store.window] == kept
-    assert not uniform_policy().components.follow_task
+    assert not policy(UNIFORM).components.follow_task
     assert Components(sb=False, roi=False, sis=False).follow_task
 
 

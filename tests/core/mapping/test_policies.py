@@ -17,7 +17,6 @@ from gausslite.mapping.policies import (
     POLICIES,
     TASK,
     disable,
-    follows_task,
     policy,
 )
 from gausslite.mapping.settings import ActivePhase, Components, KeyframeSettings, MapperSettings
@@ -25,7 +24,7 @@ from gausslite.mission.settings import MissionSettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
-BASELINES = sorted(name for name in POLICIES if not follows_task(name))
+BASELINES = sorted(name for name in POLICIES if not policy(name).components.follow_task)
 
 
 def mapped(settings: MapperSettings, frames: int = 3) -> GaussianMapper:

@@ -85,8 +85,8 @@ class CheckedTable(SplatTable):
         self.changes += 1
         assert self.count <= self.capacity == CAPACITY
         # memory is allocated once, and every view lies inside it
-        assert np.shares_memory(self.rows, self._rows) or self.count == 0
-        assert self._rows.shape == self._first_moment.shape == self._second_moment.shape == (CAPACITY, 16)
+        assert np.shares_memory(self.rows, self._columns["rows"]) or self.count == 0
+        assert all(self._columns[name].shape == (CAPACITY, 16) for name in ("rows", "first_moment", "second_moment"))
 
 
 @few_examples

@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import geometry_pb2
 from gausslite.wire.clients import FusionClient
-from gausslite.wire.convert import frame_to_message, grid_to_message
+from gausslite.wire.convert import frame_to_message
 from gausslite_bench.fuzz.mutations import Mutator
 
 KNOWN = {
@@ -122,7 +123,7 @@ NAMES = st.one_of(st.sampled_from(["", "ant", "mission"]), st.text(max_size=20))
             agent_id=NAMES,
             mission_id=NAMES,
             world_frame=NAMES,
-            grid=st.one_of(st.just(grid_to_message(GRID)), st.none()),
+            grid=st.one_of(st.just(geometry_pb2.VoxelGrid(size_m=GRID.size_m)), st.none()),
         ),
         st.builds(pb.ExportFusedMapRequest, mission_id=NAMES, strategy=st.integers(0, 9), agent_id=NAMES),
         st.builds(pb.RefineFusedMapRequest, iterations=NUMBERS, max_gaussians=NUMBERS, seed=st.integers(0, 2**64 - 1)),

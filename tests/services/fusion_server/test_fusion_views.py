@@ -25,8 +25,9 @@ from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import geometry_pb2
 from gausslite.wire.channel import require_serving
-from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
+from gausslite.wire.convert import camera_to_message, transform_to_message
 from gausslite.wire.views import MAX_VIEWS_WAITING, view_to_pngs
 from gausslite_fusion_server import servicer
 from gausslite_places.frame_aligner import MapAligner
@@ -134,7 +135,9 @@ def test_an_agent_follows_its_teammates_voxels(fusion: RunningServer) -> None:
 
 def test_a_declared_frame_moves_the_agents_map(fusion: RunningServer) -> None:
     T = transform_of(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
-    request = pb.JoinSessionRequest(agent_id="ant", grid=grid_to_message(GRID), t_fused_agent=transform_to_message(T))
+    request = pb.JoinSessionRequest(
+        agent_id="ant", grid=geometry_pb2.VoxelGrid(size_m=GRID.size_m), t_fused_agent=transform_to_message(T)
+    )
     session = fusion.stub.JoinSession(request).session_id
     fusion.contribute_subsets(session, make_subset("ant", 1, CELLS))
     batch = next(fusion.client.watch()).apply_to(empty_batch())

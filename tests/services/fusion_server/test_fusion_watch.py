@@ -23,7 +23,7 @@ from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.map_changes import EncodedPartCache
 from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.servicer import FusionServicer
-from gausslite_fusion_server.watch import FusedMapReader, WatchedPart
+from gausslite_fusion_server.watch import FusedMapReader, WatchFilter
 
 Contribute = Callable[[int, dict[int, list[int]]], None]
 
@@ -89,7 +89,7 @@ def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch)
     cache = EncodedPartCache()
     # those that exclude an agent without voxels share with the others
     excluded = [f"bee-{number}" for number in range(19)]
-    readers = [FusedMapReader(engine, WatchedPart(MapLayer.VOTE, None, name), cache) for name in ("", *excluded)]
+    readers = [FusedMapReader(engine, WatchFilter(MapLayer.VOTE, None, name), cache) for name in ("", *excluded)]
     before, _ = readers[0].snapshot()
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
     monkeypatch.setattr(FusedMapLayers, "changes", Mock(wraps=engine.maps.changes))
@@ -102,7 +102,7 @@ def test_watchers_that_follow_closely_share_each_step(monkeypatch: pytest.Monkey
     engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID), first_revision=1)
     session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
     cache = EncodedPartCache()
-    early, late = (FusedMapReader(engine, WatchedPart(MapLayer.VOTE, None, name), cache) for name in ("", "bee"))
+    early, late = (FusedMapReader(engine, WatchFilter(MapLayer.VOTE, None, name), cache) for name in ("", "bee"))
     before, _ = early.snapshot()
     monkeypatch.setattr(FusedMapLayers, "changes", Mock(wraps=engine.maps.changes))
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
