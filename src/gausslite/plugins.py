@@ -49,6 +49,7 @@ class Group(StrEnum):
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
     SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
     SERVER_SERVICES = "gausslite.server_services"  # a further service of a fusion server
+    AGENT_SERVICES = "gausslite.agent_services"  # a further service of an agent
     METRICS = "gausslite.metrics"  # serves the figures of a fusion server
     RUN_RECORDS = "gausslite.run_records"  # writes a file beside the map of a run
     EVALUATORS = "gausslite.evaluators"  # says how well a finished run fits its images

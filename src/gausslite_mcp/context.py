@@ -10,6 +10,7 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.selector import is_near, is_over
+from gausslite_objects.edits import box_distance_m
 from gausslite_selection.questions import mapped_landmark
 
 
@@ -17,7 +18,7 @@ def relations_of(landmark: ObjectLandmark, objects: Sequence[ObjectLandmark], up
     """Return the ids that the object is near (with distances of the boxes), on, and under, nearest first."""
     up = np.array(unit_up_axis(up_axis))
     others = [other for other in objects if other.object_id != landmark.object_id]
-    others.sort(key=lambda other: _box_distance_m(landmark, other))
+    others.sort(key=lambda other: box_distance_m(landmark, other))
     mapped = {other.object_id: mapped_landmark(0, other) for other in others}
     own = mapped_landmark(0, landmark)
 
@@ -26,14 +27,7 @@ def relations_of(landmark: ObjectLandmark, objects: Sequence[ObjectLandmark], up
 
     near = [other for other in others if is_near(own.seen_from(np.zeros(3)), mapped[other.object_id], up)]
     return {
-        "near": [{"id": other.object_id, "distance_m": _box_distance_m(landmark, other)} for other in near],
+        "near": [{"id": other.object_id, "distance_m": box_distance_m(landmark, other)} for other in near],
         "on": [other.object_id for other in near if over(own, mapped[other.object_id])],
         "under": [other.object_id for other in near if over(mapped[other.object_id], own)],
     }
-
-
-def _box_distance_m(one: ObjectLandmark, other: ObjectLandmark) -> float:
-    """Return the distance between two boxes; 0 if they touch."""
-    first, second = one.extent_m, other.extent_m
-    gaps_m = np.maximum(np.subtract(first.min_m, second.max_m), np.subtract(second.min_m, first.max_m))
-    return float(np.linalg.norm(np.maximum(gaps_m, 0.0)))

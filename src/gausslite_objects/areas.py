@@ -19,6 +19,7 @@ from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import CodecError, InvalidInputError, MapFileError
 from gausslite.domain.objects import MAX_OBJECT_COORDINATE_M
 from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite.domain.task import Predicate, TargetRole, TaskGraph, noun_of
 from gausslite.mission.results import read_report
 
 _FILE, CARRIED_AREAS = "areas.json", "areas"
@@ -31,6 +32,8 @@ _AFTER: Final = r"(?=\s*(?:$|[?.,!]|(?:on|near|and|or|that|which|with|is|are|the
 """Around the name of an area: the kitchen table is no place in the kitchen."""
 
 _EVERYTHING: Final = {"", "what is", "what's", "what is there", "what", "list", "show", "everything", "all", "objects"}
+
+_IN: Final = (Predicate.INSIDE, Predicate.ON)
 
 Point = tuple[float, float, float]
 
@@ -156,6 +159,54 @@ class NamedPlaces:
         """Return True for a point in these places."""
         is_inside = all(area.contains(point_m, up_axis) for area in self.inside)
         return is_inside and not any(area.contains(point_m, up_axis) for area in self.outside)
+
+
+@dataclass(frozen=True, slots=True)
+class TaskPlaces:
+    """Where the objects of a task are: in one of the areas that it names, and in none that it leaves out.
+
+    by_noun: of a target. anchors: those that are areas, in lower case. notes: on places that are none.
+    """
+
+    by_noun: Mapping[str, NamedPlaces]
+    anchors: frozenset[str]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, graph: TaskGraph, areas: Sequence[Area]) -> TaskPlaces:
+        """Find the areas among the anchors of a task, in its sentence and in its context."""
+        said = NamedPlaces.of(graph.text, areas)
+        context = {place.casefold() for place in graph.context}
+        objects = [name for name, role in zip(graph.targets, graph.roles, strict=True) if role is TargetRole.OBJECT]
+        by_noun = dict.fromkeys(map(noun_of, graph.targets), NamedPlaces(""))
+        anchors, used = set(), set[str]()
+        for area in areas:
+            name = area.name.strip().casefold()
+            related = [own for own in graph.relations if own.anchor.casefold() == name and own.predicate in _IN]
+            negated = {own.target: own.negated for own in related}
+            anchors |= {name} if related else set()
+            if not related and (area in (*said.inside, *said.outside) or name in context):
+                negated = dict.fromkeys(objects, area in said.outside)
+            used |= {name} if negated else set()
+            for target, is_outside in negated.items():
+                known, more = by_noun[noun_of(target)], ((), (area,)) if is_outside else ((area,), ())
+                by_noun[noun_of(target)] = NamedPlaces("", known.inside + more[0], known.outside + more[1])
+        unknown = [place for place in graph.context if not any(place.casefold() in name for name in used)]
+        return cls(by_noun, frozenset(anchors), tuple(describe_unknown(place, areas) for place in unknown))
+
+    def contain(self, noun: str, point_m: Point, up_axis: UpAxis) -> bool:
+        """Return True for a point where objects of the noun are meant."""
+        named = self.by_noun.get(noun)
+        if named is None:
+            return True
+        is_inside = not named.inside or any(area.contains(point_m, up_axis) for area in named.inside)
+        return is_inside and not any(area.contains(point_m, up_axis) for area in named.outside)
+
+
+def describe_unknown(place: str, areas: Iterable[Area]) -> str:
+    """Return one line on a place that a sentence names and that is no area."""
+    known = ", ".join(repr(area.name) for area in areas)
+    return f"{place!r} is no named area; {f'areas are {known}' if known else 'there are no areas yet'}"
 
 
 def _is_named(area: Area, name: str) -> bool:

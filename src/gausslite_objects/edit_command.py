@@ -21,7 +21,9 @@ _LIST, _AREA, _NO_AREA = "list", "area", "no-area"
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite edit`."""
     add = parser.add_argument
-    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
+    add(
+        "place", metavar="HOST:PORT|FOLDER", help="a fusion server, an agent, or the output folder of `map` or an agent"
+    )
     kinds = [*map(str, EditKind), _AREA, _NO_AREA, _LIST]
     add("kind", choices=kinds, help="what to do; area: name a polygon on the floor; list: print edits and areas")
     add(

@@ -19,7 +19,7 @@ from gausslite.codec.json import object_as_json, object_from_json
 from gausslite.codec.state_file import write_atomic
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import CodecError, InvalidInputError, MapFileError
-from gausslite.domain.objects import ObjectLandmark, TeamObject
+from gausslite.domain.objects import ObjectLandmark, ObjectRole, TeamObject
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.mission.results import read_report
 
@@ -30,6 +30,9 @@ _OBJECTS = ("target", "other")
 _MAX_EDITS = 1000
 _AXES = ("x", "y", "z")
 _LEAST_PART_M = 0.01
+_PROBE = "?"
+_APART_SHARE, _APART_M = 0.25, 0.05
+"""Merged objects are at most this share of the longest side of both apart, or a cell of their boxes."""
 _MARGIN_M = 0.1
 """An object is the edited one if its centre is in the edited one's box or within this of it."""
 
@@ -81,6 +84,12 @@ class Edit:
         assert self.target is not None
         found = [landmark for landmark in landmarks if _is_same(self.target, landmark)]
         return [landmark for landmark in found if landmark.object_id == self.target.object_id] or found
+
+    @property
+    def denied_noun(self) -> str:
+        """What the edited object is called and is not; empty if its name stays."""
+        is_denial = self.kind in (EditKind.DELETE, EditKind.RENAME)
+        return self.target.noun if is_denial and self.target is not None else ""
 
     def halves(self, landmark: ObjectLandmark) -> list[ObjectLandmark]:
         """Return the parts of an object on both sides of the cut; the object if the cut does not go through it."""
@@ -202,6 +211,30 @@ def require_room(edits: Sequence[Edit]) -> None:
     """Raise InvalidInputError if there are too many edits for another one."""
     if len(edits) >= _MAX_EDITS:
         raise InvalidInputError(f"edits: expected at most {_MAX_EDITS}, got more")
+
+
+def require_near(target: ObjectLandmark, other: ObjectLandmark) -> None:
+    """Raise InvalidInputError if two objects are too far apart to be one."""
+    apart_m, longest_m = box_distance_m(target, other), max(*target.size_m, *other.size_m)
+    reach_m = max(_APART_M, _APART_SHARE * longest_m)
+    if apart_m > reach_m:
+        raise InvalidInputError(
+            f"merge {target.object_id}: expected an object within {reach_m:.2f} m of its box (a quarter of the "
+            f"longest side of both), got {other.object_id}, {apart_m:.2f} m away"
+        )
+
+
+def box_distance_m(one: ObjectLandmark, other: ObjectLandmark) -> float:
+    """Return the distance between the boxes of two objects; 0 if they touch."""
+    first, second = one.extent_m, other.extent_m
+    gaps_m = np.maximum(np.subtract(first.min_m, second.max_m), np.subtract(second.min_m, first.max_m))
+    return float(np.linalg.norm(np.maximum(gaps_m, 0.0)))
+
+
+def is_denied(edits: Sequence[Edit], noun: str, point_m: tuple[float, float, float]) -> bool:
+    """Return True if people have deleted what a detector calls by a noun at a point, or have renamed it."""
+    probe = ObjectLandmark(_PROBE, noun, ObjectRole.OTHER, point_m, AxisAlignedBox(point_m, point_m), 1.0, 0, 0)
+    return not any(found.object_id == _PROBE and found.noun == noun for found in apply_edits([probe], edits).objects)
 
 
 def edit_team(objects: Sequence[TeamObject], edits: Sequence[Edit]) -> tuple[tuple[TeamObject, ...], EditedObjects]:

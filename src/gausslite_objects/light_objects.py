@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from threading import Lock
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import MapFileError
+from gausslite.domain.errors import CodecError, MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import (
     MAX_OBJECTS_PER_AGENT,
@@ -26,7 +27,8 @@ from gausslite.domain.objects import (
 )
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.relevance import UNNAMED, Detection, PointM, RelevanceMap
-from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.nouns import normalised_noun, same_kind
 from gausslite.perception.detector import Detector
 from gausslite.perception.evidence import Evidence, VisibilityCheck
@@ -36,6 +38,8 @@ from gausslite.perception.relevance import RelevanceEstimate, RelevanceEstimator
 from gausslite.perception.relevance_tracker import decode_landmark, encode_landmark
 from gausslite.perception.settings import EvidenceSettings
 from gausslite.perception.surface import SurfaceVotes
+from gausslite_objects.areas import Area, TaskPlaces, decode_areas, encode_areas
+from gausslite_objects.edits import Edit, decode_edits, effective, encode_edits, is_denied
 
 _MAX_REPORTED = 100
 """Of one robot: 14 kB in a report."""
@@ -50,23 +54,41 @@ _CLASSES = (MatchBasis.GENERIC, MatchBasis.REGION)
 
 
 class LightObjects:
-    """A Detector that also detects all classes of another one, and remembers them. Thread-safe.
+    """A Detector that also detects all classes of another one, and remembers them and what people say. Thread-safe.
 
-    A detector that is prompted by text has no classes: then nothing is remembered.
+    A detector that is prompted by text has no classes: then nothing is remembered. What people say is changed between
+    frames: a noun of the task means nothing that an edit denies, and nothing outside of the area that the task names.
     """
 
     def __init__(self, detector: Detector, up_axis: UpAxis) -> None:
-        self._detector, self._up = detector, np.array(unit_up_axis(up_axis))
+        self._detector, self._up_axis, self._up = detector, up_axis, np.array(unit_up_axis(up_axis))
         self._has_classes = detector.matches((UNNAMED,))[0].basis in _CLASSES
         self._evidence, self._seen = Evidence(EvidenceSettings()), ObjectMap()
         self._lock = Lock()
+        self.edits: tuple[Edit, ...] = ()
+        self.areas: tuple[Area, ...] = ()
+        self._graph = TaskGraph("", "", (), (), ())
+        self.places = TaskPlaces.of(self._graph, ())
+        """Where the objects of the task's nouns are."""
+        self.changes = 0
+        """How often people have changed what the task's nouns mean."""
+
+    def change(self, edits: tuple[Edit, ...], areas: tuple[Area, ...]) -> bool:
+        """Replace what people said; return True if the task's nouns mean other objects now."""
+        before, self.edits, self.areas = self._meaning(), edits, areas
+        self.places = TaskPlaces.of(self._graph, areas)
+        is_other = self._meaning() != before
+        self.changes += is_other
+        return is_other
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
-        """Return what the detector searches for each query."""
-        return self._detector.matches(queries)
+        """Return what the detector searches for each query, and where its objects can be."""
+        found = self._detector.matches(queries)
+        return tuple(replace(match, is_there=partial(self._is_there, match.noun)) for match in found)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
-        """Return the detections of the queries; those of all classes enter the memory."""
+        """Return the detections of the queries that are no areas; those of all classes enter the memory."""
+        queries = tuple(query for query in queries if query.casefold() not in self.places.anchors)
         if not self._has_classes:
             return self._detector.detect(frame, queries)
         is_asked = UNNAMED in queries
@@ -74,9 +96,19 @@ class LightObjects:
         self._observe(frame, [seen for seen in found if seen.phrase == UNNAMED and seen.class_name])
         return found if is_asked else [seen for seen in found if seen.phrase != UNNAMED]
 
-    def remember(self, estimator: RelevanceEstimator) -> RelevanceEstimator:
-        """Return the estimator with these objects after its own."""
+    def remember(self, estimator: RelevanceEstimator, graph: TaskGraph) -> RelevanceEstimator:
+        """Return the task's estimator with these objects after its own."""
+        self._graph, self.places = graph, TaskPlaces.of(graph, self.areas)
         return RememberingEstimator(estimator, self)
+
+    def _meaning(self) -> object:
+        nouns = set(map(noun_of, self._graph.targets))
+        return self.places, [edit for edit in effective(self.edits) if edit.denied_noun in nouns]
+
+    def _is_there(self, noun: str, point_m: Float64[ndarray, "3"]) -> bool:
+        x, y, z = point_m.tolist()
+        is_meant = self.places.contain(noun, (x, y, z), self._up_axis)
+        return is_meant and not (self.edits and is_denied(self.edits, noun, (x, y, z)))
 
     def _observe(self, frame: Frame, detections: Sequence[Detection]) -> None:
         named = [replace(found, phrase=normalised_noun(found.class_name)) for found in detections if not found.is_weak]
@@ -106,14 +138,22 @@ class LightObjects:
         return kept[:_MAX_REPORTED]
 
     def state(self) -> State:
-        """Return what is remembered as named arrays."""
+        """Return what is remembered and said as named arrays."""
         with self._lock:
             landmarks = self._seen.objects
             encoded = [add_prefix(f"landmark-{i}", encode_landmark(landmark)) for i, landmark in enumerate(landmarks)]
-        return {"count": int_array(len(landmarks)), **{name: own[name] for own in encoded for name in own}}
+        said = {"edits": encode_edits(self.edits), "areas": encode_areas(self.areas)}
+        arrays = {name: np.frombuffer(data, np.uint8) for name, data in said.items()}
+        return {"count": int_array(len(landmarks)), **arrays, **{name: own[name] for own in encoded for name in own}}
 
     def restore(self, state: State) -> None:
-        """Replace what is remembered. Raises MapFileError, InvalidInputError."""
+        """Replace what is remembered and said. Raises MapFileError, InvalidInputError."""
+        edits, areas = (get_array(state, name, (None,), np.uint8).tobytes() for name in ("edits", "areas"))
+        try:
+            self.edits, self.areas = decode_edits(edits), decode_areas(areas)
+        except CodecError as error:
+            raise MapFileError(f"state light objects: {error}") from error
+        self.places = TaskPlaces.of(self._graph, self.areas)
         (count,) = get_counts(state, "count", 1)
         if count > len(state):
             raise MapFileError(f"state light objects: expected {count} landmarks, got fewer")
@@ -125,14 +165,17 @@ class RememberingEstimator(RelevanceEstimator):
     """A RelevanceEstimator with the light objects of its detector among its objects and in its state."""
 
     def __init__(self, estimator: RelevanceEstimator, memory: LightObjects) -> None:
-        self._estimator, self._memory = estimator, memory
+        self._estimator, self._memory, self._changes = estimator, memory, memory.changes
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return the task's relevance of one frame."""
         return self._estimator.estimate(frame, rendered_depth_m)
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
-        """Return the task's relevance of an earlier frame."""
+        """Return the relevance of an earlier frame; after people changed what the task means, of what is known."""
+        if self._memory.changes > self._changes:
+            # the detections of this frame are in it
+            return self._estimator.complete(frame, RelevanceMap.empty(*frame.depth_m.shape))
         return self._estimator.evaluate_past(frame)
 
     @property
@@ -146,8 +189,10 @@ class RememberingEstimator(RelevanceEstimator):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages for the operator."""
-        return self._estimator.notes
+        """Messages for the operator; none on anchors that are areas."""
+        places = self._memory.places
+        own = (note for note in self._estimator.notes if not any(repr(name) in note for name in places.anchors))
+        return (*own, *places.notes)
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -158,7 +203,8 @@ class RememberingEstimator(RelevanceEstimator):
     @property
     def nouns(self) -> tuple[NounReport, ...]:
         """What is searched for each noun of the task, and what was detected."""
-        return self._estimator.nouns
+        anchors = self._memory.places.anchors
+        return tuple(noun for noun in self._estimator.nouns if noun.match.noun.casefold() not in anchors)
 
     def point_at(self, noun: str, mask: Bool[ndarray, "h w"], frame: Frame) -> None:
         """Add the object that a person points at. Raises InvalidInputError."""

@@ -17,12 +17,12 @@ from gausslite.datasets.pose_track import read_pose_rows
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.objects import Answer, ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.pose import UpAxis, upward_axis
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import Predicate, TaskGraph
 from gausslite.mission.results import MAP, TRAJECTORY, read_report, stated_up
 from gausslite.plugins import Group, load
 from gausslite.wire.security import Tls
 from gausslite_language.rules import RuleParser
-from gausslite_objects.areas import Area, NamedPlaces, read_areas
+from gausslite_objects.areas import Area, NamedPlaces, describe_unknown, read_areas
 from gausslite_objects.edits import EditedObjects, apply_edits, read_edits
 from gausslite_objects.life import Life, life_of
 from gausslite_objects.object_memory import ObjectMemory, RunMemory, reported_objects
@@ -83,14 +83,14 @@ def read_folder(folder: Path) -> MappedObjects:
 
 
 def open_memory(place: str, tls: Tls | None = None) -> ObjectMemory:
-    """Return the memory of a run's folder or of a fusion server at HOST:PORT. Raises InvalidInputError."""
+    """Return the memory of a run's folder, or of a fusion server or an agent at HOST:PORT. Raises InvalidInputError."""
     if Path(place).is_dir():
         return RunMemory(Path(place))
     # imported late, because the objects of a folder need no gRPC
     from gausslite.wire.channel import require_callable
     from gausslite_objects.memory_client import ServerMemory
 
-    require_callable("a fusion server or the output folder of a run", place)
+    require_callable("a fusion server, an agent or the output folder of a run", place)
     return ServerMemory(place, tls)
 
 
@@ -110,7 +110,9 @@ def select(place: MappedObjects, question: str) -> tuple[Sequence[TeamObject], S
     by_id = {team_object.landmark.object_id: team_object for team_object in objects}
     answer: Callable[..., Answer] = load(Group.QUESTIONS, purpose="questions")
     found = answer(graph, [team_object.landmark for team_object in objects], place.up_axis, place.T_world_camera)
-    return [by_id[landmark.object_id] for landmark in found.objects], found.notes
+    anchors = [own.anchor for own in graph.relations if own.predicate is Predicate.INSIDE and not found.objects]
+    unknown = [describe_unknown(name, place.areas) for name in dict.fromkeys((*graph.context, *anchors))]
+    return [by_id[landmark.object_id] for landmark in found.objects], (*found.notes, *unknown)
 
 
 def as_json(team_object: TeamObject, place: MappedObjects) -> dict[str, object]:

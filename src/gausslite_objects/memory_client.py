@@ -1,4 +1,4 @@
-"""The edits and areas of a fusion server, by its MemoryService."""
+"""The edits and areas of a fusion server or an agent, by its MemoryService."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Remarks:
 class MemoryClient(ServiceChannel):
     """Calls MemoryService."""
 
-    kind = "fusion server"
+    kind = "service"
 
     def __init__(self, address: str, tls: Tls | None = None) -> None:
         super().__init__(address, tls=tls)
@@ -54,7 +54,7 @@ class MemoryClient(ServiceChannel):
 
 
 class ServerMemory:
-    """The ObjectMemory of a fusion server; each call has a channel of its own."""
+    """The ObjectMemory of a fusion server or an agent; each call has a channel of its own."""
 
     def __init__(self, address: str, tls: Tls | None = None) -> None:
         self._address, self._tls = address, tls

@@ -1,4 +1,4 @@
-"""The methods of MemoryService: edits and areas of a fusion server's mission, kept in its store.
+"""The methods of MemoryService, and what it serves of a fusion server: edits and areas of a mission, in its store.
 
 `memory_service` is a plug-in of the group `gausslite.server_services`.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+from collections.abc import Callable
 from threading import Lock
-from typing import Any
+from typing import Any, Protocol
 
 from gausslite.fusion.engine import FusionEngine
 from gausslite.v1 import memory_service_pb2 as pb
@@ -18,7 +19,7 @@ from gausslite.wire.security import Caller
 from gausslite.wire.server import Service
 from gausslite_fusion_server.plugins import FindEngine
 from gausslite_objects.areas import Area, decode_areas, encode_areas, with_area, without_area
-from gausslite_objects.edits import decode_edits, encode_edits
+from gausslite_objects.edits import Edit, EditedObjects, apply_edits, decode_edits, encode_edits
 from gausslite_objects.memory_client import area_from_message, area_to_message, entry_to_message, kind_from_number
 from gausslite_objects.object_memory import EditEntry, new_edit
 from gausslite_objects.team_objects import EDITS_RECORD, MergedObjects
@@ -31,17 +32,50 @@ _NOBODY = ""
 _log = logging.getLogger(__name__)
 
 
+class ServedPlace(Protocol):
+    """Where a running service keeps edits and areas. Its methods may block, and raise GaussLiteError."""
+
+    def edits(self) -> tuple[Edit, ...]:
+        """Return all edits, oldest first."""
+        ...
+
+    def save_edits(self, edits: tuple[Edit, ...]) -> None:
+        """Replace the edits, durably."""
+        ...
+
+    def areas(self) -> tuple[Area, ...]:
+        """Return the named areas."""
+        ...
+
+    def save_areas(self, areas: tuple[Area, ...]) -> None:
+        """Replace the areas, durably."""
+        ...
+
+    def objects(self) -> EditedObjects:
+        """Return the objects after all edits, and what people said of them."""
+        ...
+
+
+FindPlace = Callable[[str], ServedPlace]
+"""Returns the place of a mission. Raises MismatchError for another mission."""
+
+
 def memory_service(engine: FindEngine) -> Service:
-    """Return the service of a server."""
-    register = functools.partial(pb_grpc.add_MemoryServiceServicer_to_server, MemoryServicer(engine))
+    """Return the service of a fusion server."""
+    return service_of(lambda mission_id: TeamPlace(engine(), mission_id))
+
+
+def service_of(place: FindPlace) -> Service:
+    """Return the service of a place."""
+    register = functools.partial(pb_grpc.add_MemoryServiceServicer_to_server, MemoryServicer(place))
     return Service("gausslite.v1.MemoryService", register)
 
 
 class MemoryServicer(pb_grpc.MemoryServiceServicer):
     """Edits objects as the caller; the work runs in threads, one change at a time."""
 
-    def __init__(self, engine: FindEngine) -> None:
-        self._engine = engine
+    def __init__(self, place: FindPlace) -> None:
+        self._place = place
         self._changing = Lock()
 
     async def EditObject(self, request: pb.EditObjectRequest, context: Any) -> pb.EditObjectResponse:
@@ -62,43 +96,60 @@ class MemoryServicer(pb_grpc.MemoryServiceServicer):
         return await asyncio.to_thread(self._read, request)
 
     def _edit(self, request: pb.EditObjectRequest, author: str) -> EditEntry:
-        engine, kind = self._engine_of(request.mission_id), kind_from_number(request.kind)
+        place, kind = self._place(request.mission_id), kind_from_number(request.kind)
         with self._changing:
-            edits = decode_edits(engine.store.find_record(_NOBODY, EDITS_RECORD))
-            objects = [found.landmark for found in engine.query_objects()]
-            made = new_edit(edits, objects, kind, request.object_id, request.value, author)
-            engine.store.save_record(_NOBODY, EDITS_RECORD, encode_edits((*edits, made)))
+            edits = place.edits()
+            made = new_edit(edits, place.objects().objects, kind, request.object_id, request.value, author)
+            place.save_edits((*edits, made))
         return EditEntry.of(len(edits) + 1, made)
 
     def _set_area(self, request: pb.SetAreaRequest) -> None:
-        engine, area = self._engine_of(request.mission_id), request.area
+        place, area = self._place(request.mission_id), request.area
         with self._changing:
-            areas = _areas(engine)
-            areas = with_area(areas, area_from_message(area)) if area.corners_m else without_area(areas, area.name)
-            engine.store.save_record(_NOBODY, _AREAS_RECORD, encode_areas(areas))
+            areas = place.areas()
+            changed = with_area(areas, area_from_message(area)) if area.corners_m else without_area(areas, area.name)
+            place.save_areas(changed)
 
     def _read(self, request: pb.GetMemoryRequest) -> pb.GetMemoryResponse:
-        engine = self._engine_of(request.mission_id)
-        edits = decode_edits(engine.store.find_record(_NOBODY, EDITS_RECORD))
-        remarks = []
-        if isinstance(engine.merged_objects, MergedObjects):
-            engine.query_objects()
-            edited = engine.merged_objects.edited
-            remarks = [
+        place = self._place(request.mission_id)
+        edited = place.objects()
+        return pb.GetMemoryResponse(
+            edits=[entry_to_message(EditEntry.of(number, edit)) for number, edit in enumerate(place.edits(), 1)],
+            areas=map(area_to_message, place.areas()),
+            remarks=[
                 pb.ObjectRemarks(object_id=name, is_pinned=name in edited.pinned, notes=edited.notes.get(name, ()))
                 for name in sorted(edited.pinned | edited.notes.keys())
-            ]
-        return pb.GetMemoryResponse(
-            edits=[entry_to_message(EditEntry.of(number, edit)) for number, edit in enumerate(edits, 1)],
-            areas=map(area_to_message, _areas(engine)),
-            remarks=remarks,
+            ],
         )
 
-    def _engine_of(self, mission_id: str) -> FusionEngine:
-        engine = self._engine()
+
+class TeamPlace:
+    """The ServedPlace of a fusion server's mission: records of its store."""
+
+    def __init__(self, engine: FusionEngine, mission_id: str) -> None:
+        """Raises MismatchError for another mission than the engine's."""
         engine.members.require_mission(mission_id)
-        return engine
+        self._engine = engine
 
+    def edits(self) -> tuple[Edit, ...]:
+        """Return all edits, oldest first. Raises CodecError."""
+        return decode_edits(self._engine.store.find_record(_NOBODY, EDITS_RECORD))
 
-def _areas(engine: FusionEngine) -> tuple[Area, ...]:
-    return decode_areas(engine.store.find_record(_NOBODY, _AREAS_RECORD))
+    def save_edits(self, edits: tuple[Edit, ...]) -> None:
+        """Replace the edits. Raises StorageError."""
+        self._engine.store.save_record(_NOBODY, EDITS_RECORD, encode_edits(edits))
+
+    def areas(self) -> tuple[Area, ...]:
+        """Return the named areas. Raises CodecError."""
+        return decode_areas(self._engine.store.find_record(_NOBODY, _AREAS_RECORD))
+
+    def save_areas(self, areas: tuple[Area, ...]) -> None:
+        """Replace the areas. Raises StorageError."""
+        self._engine.store.save_record(_NOBODY, _AREAS_RECORD, encode_areas(areas))
+
+    def objects(self) -> EditedObjects:
+        """Return the team's objects after all edits; without remarks if another package merges them."""
+        objects, merged = self._engine.query_objects(), self._engine.merged_objects
+        if isinstance(merged, MergedObjects):
+            return merged.edited
+        return apply_edits([found.landmark for found in objects], ())

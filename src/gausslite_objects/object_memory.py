@@ -15,7 +15,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_report
 from gausslite_objects.areas import Area, read_areas, with_area, without_area, write_areas
-from gausslite_objects.edits import Edit, EditKind, apply_edits, read_edits, require_room, write_edits
+from gausslite_objects.edits import Edit, EditKind, apply_edits, read_edits, require_near, require_room, write_edits
 
 _NEEDS_VALUE = (EditKind.RENAME, EditKind.MERGE, EditKind.NOTE)
 
@@ -124,6 +124,8 @@ def new_edit(
         raise InvalidInputError(f"{kind} {quote_name(object_id)}: expected a value, got none")
     target = _with_id(objects, object_id)
     other = _with_id(objects, value) if kind is EditKind.MERGE else None
+    if other is not None:
+        require_near(target, other)
     return Edit(kind, author, now_ns, target, value, other)
 
 

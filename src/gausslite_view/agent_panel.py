@@ -12,10 +12,12 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_task import object_from_message
 from gausslite_link.map_follower import MapFollower
+from gausslite_objects.object_memory import ObjectMemory
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
 from gausslite_view.decoding import camera_view_from_message
 from gausslite_view.map_page import MapPage, TaskField, text_html
+from gausslite_view.objects_panel import ObjectsPanel
 from gausslite_view.plots import HistoryPlot, QualityPlot
 from gausslite_view.pointing import PointingPanel
 
@@ -26,7 +28,7 @@ _KB = 1e3
 class AgentPanel:
     """Owns the page's content while it follows one agent. `poll` is called on one thread."""
 
-    def __init__(self, page: MapPage, client: AgentClient) -> None:
+    def __init__(self, page: MapPage, client: AgentClient, memory: ObjectMemory) -> None:
         self._page, self._client = page, client
         self._follower = MapFollower(client.watch_map)
         self._started_s = self._polled_s = time.monotonic()
@@ -39,6 +41,7 @@ class AgentPanel:
             self._end = gui.add_button("End mission", color="red")
             self._message = gui.add_html("")
         self._pointing = PointingPanel(page, client)
+        self.objects = ObjectsPanel(page, memory, self._draw_again)
         self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
@@ -68,6 +71,7 @@ class AgentPanel:
             self._quality.add(time.monotonic() - self._started_s, rendered, view.rgb, view.roi)
             keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]
             contents = replace(contents, times_ns=view.times_ns, T_world_camera=view.path, keyframes=keyframes)
+        self.objects.show(contents)
         self._page.remember(contents)
         self._page.show(contents)
         self._shown_revision = followed.revision
@@ -76,6 +80,9 @@ class AgentPanel:
         """Close the client and end the follower."""
         self._client.close()
         self._follower.close()
+
+    def _draw_again(self) -> None:
+        self._shown_revision = -1
 
     def _show_status(self, status: Any) -> None:
         now_s, uplink = time.monotonic(), status.uplink

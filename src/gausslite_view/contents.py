@@ -16,7 +16,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.arrays import require_array
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite.domain.pose import upward_axis
+from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite_link.map_follower import FollowedMap
 from gausslite_view.oriented_box import OrientedBox
@@ -64,6 +64,11 @@ class ViewContents:
         if self.state_ns is not None:
             return self.state_ns
         return int(self.times_ns[-1]) if len(self.times_ns) else None
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """The upward direction, by the poses of its cameras."""
+        return upward_axis(_poses(self))
 
     @classmethod
     def of_one_agent(cls, gaussians: Gaussians, agent_id: str = "") -> ViewContents:
@@ -270,7 +275,7 @@ def start_view(contents: ViewContents) -> StartView:
 
 def object_boxes(contents: ViewContents) -> list[OrientedBox]:
     """Return the box of each object."""
-    up_axis = upward_axis(_poses(contents))
+    up_axis = contents.up_axis
     return [OrientedBox.enclosing(landmark.corners_m, up_axis) for landmark in contents.objects]
 
 

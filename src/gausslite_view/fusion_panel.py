@@ -69,11 +69,11 @@ class FusionPanel:
         self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
         targets = {agent.agent_id: tuple(agent.targets) for agent in status.agents}
         objects = tuple(team_object.landmark for team_object in self._client.query_objects())
-        self.objects.show(objects)
         state_ns = round(time_s * _NS_PER_S)
         paths = self._keyframes.paths()
         fused = replace(followed_contents(followed, targets), objects=objects, paths=paths, state_ns=state_ns)
         fused = replace(fused, keyframes=self._cameras.draw(fused, state_ns))
+        self.objects.show(fused)
         # the slider goes back in the fused map, whichever map is shown now
         self._page.remember(fused)
         self._page.show(fused if layer == _FUSED else self._download(layer, targets, fused))

@@ -99,7 +99,8 @@ def _follow(
     from gausslite_view.fusion_panel import FusionPanel
 
     client = open_client()
-    panel = AgentPanel(page, client) if isinstance(client, AgentClient) else FusionPanel(page, client, memory)
+    panel: AgentPanel | FusionPanel
+    panel = AgentPanel(page, client, memory) if isinstance(client, AgentClient) else FusionPanel(page, client, memory)
     poll: Callable[[], None] = panel.poll
     try:
         while not stopped.wait(_POLL_S):

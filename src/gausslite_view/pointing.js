@@ -1,6 +1,7 @@
-// Show the dialog of an image; send the person's click or box, in shares of the image, and the noun as one message.
+// Show the dialog of an image; send the person's click, box or corners, in shares of the image, and the noun as one message.
 (image) => {
-  const dialog = image.closest("dialog"), [box, noun, close] = ["div>div", "input", "button"].map((name) => dialog.querySelector(name));
+  const dialog = image.closest("dialog"), [box, polygon, noun, button] = ["div>div", "polygon", "input", "button"].map((name) => dialog.querySelector(name));
+  const isArea = dialog.dataset.most > 2, drawn = [];
   const answer = (prompt) => {
     dialog.close();
     // viser has no event for a click on HTML; its own tests send messages through this object
@@ -20,17 +21,23 @@
     start = share(event);
   };
   image.onpointermove = (event) => {
-    if (!start) return;
+    if (!start || isArea) return;
     const [[left, top], [right, bottom]] = corners(event).map((corner) => corner.map((value) => 100 * value));
     box.style.cssText += `;display:block;left:${left}%;top:${top}%;width:${right - left}%;height:${bottom - top}%`;
   };
   image.onpointerup = (event) => {
     if (!start) return;
     const [first, last] = corners(event);
+    if (isArea) {
+      drawn.push(start);
+      polygon.setAttribute("points", drawn.join(" "));
+      start = null;
+      return;
+    }
     const moved_px = Math.max((last[0] - first[0]) * image.clientWidth, (last[1] - first[1]) * image.clientHeight);
     answer(moved_px > 4 ? [first, last] : [start]);
   };
-  close.onclick = () => answer([]);
+  button.onclick = () => answer(drawn);
   dialog.oncancel = () => answer([]);
   dialog.showModal();
 }

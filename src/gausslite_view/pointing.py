@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from importlib.resources import files
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 import viser
@@ -29,7 +29,7 @@ _MAP_WIDTH_PX: Final = 640
 """Of the image of the map that a person clicks."""
 
 Prompt = tuple[tuple[float, float], ...]
-"""A point (x, y) in pixels of an image, or two opposite corners of a box, the left top one first."""
+"""A point (x, y) in pixels of an image, two opposite corners of a box, the left top one first, or those of an area."""
 
 
 class PointableMission(Protocol):
@@ -86,7 +86,7 @@ class PointingPanel:
 
     def _ask_in_map(self, browser: Any) -> str:
         """Take a click on the map, rendered as the browser shows it, as the object. Raises GaussLiteError."""
-        camera, T_world_camera = _shown_view(browser.camera)
+        camera, T_world_camera = shown_view(browser.camera)
         rgb, depth_m = self._mission.render(camera, T_world_camera)
         image = (255 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
 
@@ -149,13 +149,28 @@ class PointingPanel:
             self._message.content = text_html([str(error)])
 
 
-_DIALOG = """<dialog id="{uuid}" style="border:0;padding:0.7em;border-radius:0.4em">
-<p style="margin:0 0 0.6em;display:flex;gap:0.8em;align-items:center">{caption}: click the object, or drag a box around
-it <input placeholder="noun, may be empty" value="" style="flex:1"><button>Close</button></p>
+class Question(NamedTuple):
+    """What a person is asked on an image. most: points of the answer."""
+
+    hint: str
+    placeholder: str
+    button: str
+    most: int
+
+
+OBJECT: Final = Question("click the object, or drag a box around it", "noun, may be empty", "Close", 2)
+AREA: Final = Question("click the corners of the area around it, then Done", "name of the area", "Done", 200)
+_DIALOG = """<dialog id="{uuid}" data-most="{most}" style="border:0;padding:0.7em;border-radius:0.4em">
+<p style="margin:0 0 0.6em;display:flex;gap:0.8em;align-items:center">{caption}: {hint}
+<input placeholder="{placeholder}" value="" style="flex:1"><button>{button}</button></p>
 <div style="position:relative;line-height:0;width:fit-content;margin:auto">
 <img src="data:image/jpeg;base64,{jpeg}" onload="({script})(this)" alt=""
 style="width:min(92vw,{aspect:.4f}*84vh);cursor:crosshair;touch-action:none">
-<div style="display:none;position:absolute;border:2px solid #3ce65a;pointer-events:none"></div></div></dialog>"""
+<div style="display:none;position:absolute;border:2px solid #3ce65a;pointer-events:none"></div>
+<svg viewBox="0 0 1 1" preserveAspectRatio="none"
+style="position:absolute;inset:0;width:100%;height:100%;pointer-events:none">
+<polygon points="" fill="#3ce65a55" stroke="#3ce65a" stroke-width="2" vector-effect="non-scaling-stroke"/></svg>
+</div></dialog>"""
 
 
 def ask_on_image(
@@ -163,10 +178,11 @@ def ask_on_image(
     rgb: UInt8[ndarray, "h w 3"],
     caption: str,
     chosen: Callable[[Prompt, str], None],
+    question: Question = OBJECT,
 ) -> Callable[[], None]:
-    """Show an image over one browser's page until a person clicks it, drags a box on it or closes it.
+    """Show an image over one browser's page until a person answers the question on it or closes it.
 
-    It is HTML, which a browser without a GPU shows between two images of the map. `chosen` gets the point or the box,
+    It is HTML, which a browser without a GPU shows between two images of the map. `chosen` gets the points,
     empty if the image was closed, and the noun typed beside it. Return a function that removes the image.
     """
     height_px, width_px = rgb.shape[:2]
@@ -176,13 +192,14 @@ def ask_on_image(
         _DIALOG.format(
             uuid=answer._impl.uuid,
             caption=html.escape(caption),
+            **question._asdict(),
             jpeg=base64.b64encode(jpeg).decode(),
             script=html.escape((files("gausslite_view") / "pointing.js").read_text()),
             aspect=width_px / height_px,
         )
     )
 
-    answer.on_update(lambda _: chosen(*read_answer(str(answer.value), width_px, height_px)))
+    answer.on_update(lambda _: chosen(*read_answer(str(answer.value), width_px, height_px, question.most)))
 
     def end() -> None:
         dialog.remove()
@@ -191,7 +208,7 @@ def ask_on_image(
     return end
 
 
-def read_answer(message: str, width_px: int, height_px: int) -> tuple[Prompt, str]:
+def read_answer(message: str, width_px: int, height_px: int, most: int = 2) -> tuple[Prompt, str]:
     """Return the prompt, from shares to pixels of the image, and the noun of a browser's message.
 
     A message that this page's script does not send is read as an image that was closed.
@@ -201,13 +218,13 @@ def read_answer(message: str, width_px: int, height_px: int) -> tuple[Prompt, st
         shares, noun = np.array(answer["prompt"], np.float64).reshape(-1, 2), str(answer["noun"])
     except (ValueError, TypeError, KeyError, RecursionError):
         return (), ""
-    if len(shares) > 2 or not np.isfinite(shares).all():
+    if len(shares) > most or not np.isfinite(shares).all():
         return (), ""
     prompt = np.clip(shares * (width_px, height_px), 0, np.nextafter((width_px, height_px), 0))
     return tuple((x, y) for x, y in prompt.tolist()), noun
 
 
-def _shown_view(shown: viser.CameraHandle) -> tuple[Camera, Float64[ndarray, "4 4"]]:
+def shown_view(shown: viser.CameraHandle) -> tuple[Camera, Float64[ndarray, "4 4"]]:
     """Return the camera with which a browser shows the map."""
     width_px, height_px = _MAP_WIDTH_PX, max(1, round(_MAP_WIDTH_PX / shown.aspect))
     focal_px = height_px / 2 / math.tan(shown.fov / 2)

@@ -88,12 +88,12 @@ def _add_objects(page: MapPage, folder: Path, contents: ViewContents) -> None:
     from gausslite_view.objects_panel import ObjectsPanel
 
     def show() -> None:
-        objects = edited_objects(folder)
-        panel.show(objects)
-        page.show(replace(contents, objects=objects))
+        edited = replace(contents, objects=edited_objects(folder))
+        panel.show(edited)
+        page.show(edited)
 
     panel = ObjectsPanel(page, RunMemory(folder), show)
-    panel.show(contents.objects)
+    panel.show(contents)
 
 
 @contextmanager

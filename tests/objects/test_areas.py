@@ -10,7 +10,8 @@ import pytest
 from run_folders import MUG, write_run
 
 from gausslite.cli.main import main
-from gausslite_objects.areas import CARRIED_AREAS, Area, NamedPlaces, read_areas
+from gausslite.domain.task import Predicate, Relation, TargetRole, TaskGraph
+from gausslite_objects.areas import CARRIED_AREAS, Area, NamedPlaces, TaskPlaces, read_areas
 
 UP = (0.0, 0.0, 1.0)
 SQUARE = ("0,0,0", "2,0,0", "2,1,0", "0,1,0")
@@ -90,3 +91,40 @@ def test_a_large_coordinate_does_not_blur_an_outline() -> None:
     far = replace(KITCHEN, corners_m=tuple((x + 5e5, y, z) for x, y, z in KITCHEN.corners_m))
     assert far.contains((5e5 + 0.01, 0.5, 0.5), UP)
     assert not far.contains((5e5 - 0.01, 0.5, 0.5), UP)
+
+
+HALL = Area("dining hall", tuple((x, y + 2.0, z) for x, y, z in KITCHEN.corners_m))
+IN_KITCHEN = Relation(Predicate.INSIDE, "mug", "kitchen")
+
+
+@pytest.mark.parametrize(
+    ("graph", "kitchen", "hall"),
+    [
+        (TaskGraph("", "Find the mug", ("mug",), (), ()), True, True),
+        (TaskGraph("", "Find the mug in the kitchen", ("mug",), (), ()), True, False),
+        (TaskGraph("", "", ("mug",), (), (), context=("kitchen",)), True, False),
+        (TaskGraph("", "Find the mug in the kitchen or in the dining hall", ("mug",), (), ()), True, True),
+        (TaskGraph("", "Find the mug outside the kitchen", ("mug",), (), ()), False, True),
+        (TaskGraph("", "", ("mug", "cup"), ("kitchen",), (IN_KITCHEN,)), True, False),
+        (TaskGraph("", "", ("mug", "cup"), ("kitchen",), (replace(IN_KITCHEN, negated=True),)), False, True),
+        (TaskGraph("", "", ("cup", "mug"), ("kitchen",), (replace(IN_KITCHEN, target="cup"),)), True, True),
+        (TaskGraph("", "in the kitchen", ("mug",), (), (), roles=(TargetRole.DESTINATION,)), True, True),
+    ],
+)
+def test_a_task_names_areas(graph: TaskGraph, kitchen: bool, hall: bool) -> None:
+    places = TaskPlaces.of(graph, [KITCHEN, HALL])
+    assert [places.contain("mug", point_m, UP) for point_m in ((1.0, 0.5, 0.8), (1.0, 2.5, 0.8))] == [kitchen, hall]
+    assert places.notes == ()
+    assert places.contain("plate", (9.0, 9.0, 9.0), UP)
+
+
+def test_a_place_that_is_no_area_is_named_with_those_that_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    garage = TaskGraph("", "Find the mug in the garage", ("mug",), (), (), context=("garage",))
+    assert TaskPlaces.of(garage, ()).notes == ("'garage' is no named area; there are no areas yet",)
+    run = write_run(tmp_path / "run", up=[0.0, 0.0, 1.0])
+    assert main(["edit", str(run), "area", "kitchen", *SQUARE]) == 0
+    capsys.readouterr()
+    main(["objects", str(run), "mugs in the garage"])
+    assert "note: 'garage' is no named area; areas are 'kitchen'\n" in capsys.readouterr().out

@@ -17,6 +17,7 @@ from gausslite.domain.pose import transform_of
 from gausslite_objects.edits import CARRIED, Edit, EditedObjects, EditKind, apply_edits, edits_as_json, read_edits
 
 FOUND = object_from_json(MUG)
+PARTS = (("far", 1.0), ("near", 0.32))
 
 
 def _edited(run: Path, *found: ObjectLandmark) -> EditedObjects:
@@ -72,6 +73,14 @@ def test_a_pinned_object_stays_and_merged_ones_are_one(run: Path) -> None:
     merge = Edit(EditKind.MERGE, "ann", 1, FOUND, half.object_id, half)
     [merged] = apply_edits([FOUND, replace(half, confidence=1.0)], [merge]).objects
     assert (merged.object_id, merged.confidence) == (FOUND.object_id, 1.0)
+
+
+def test_objects_that_are_apart_are_not_merged(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    far, near = ({**MUG, "id": name, "min_m": [x, 0.4, 0.9], "max_m": [x + 0.1, 0.6, 1.1]} for name, x in PARTS)
+    both = write_run(tmp_path / "both", objects=[MUG, far, near])
+    assert main(["edit", str(both), "merge", "mug-1", "far"]) == 2
+    assert "expected an object within 0.05 m of its box" in capsys.readouterr().err
+    assert main(["edit", str(both), "merge", "mug-1", "near"]) == 0
 
 
 def test_a_split_object_is_two_also_when_it_is_found_again(run: Path) -> None:

@@ -13,6 +13,7 @@ from fusion_running import GRAPH, GRID, MUG, fusion_server
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
+from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import memory_service_pb2 as pb
 from gausslite.v1 import memory_service_pb2_grpc as pb_grpc
@@ -59,12 +60,12 @@ def test_edits_of_a_team_win_over_later_reports_and_survive_a_restart(tmp_path: 
 
 
 def test_merged_and_split_objects_keep_their_observers() -> None:
-    far = replace(MUG, object_id="mug-2", centroid_m=(3.0, 2.0, 3.0))
-    far = replace(far, extent_m=replace(MUG.extent_m, min_m=(2.9, 1.9, 2.9), max_m=(3.1, 2.1, 3.1)))
+    beside = replace(MUG, object_id="mug-2", centroid_m=(1.22, 2.0, 3.0))
+    beside = replace(beside, extent_m=AxisAlignedBox((1.12, 1.9, 2.9), (1.32, 2.1, 3.1)))
     with fusion_server() as server:
         memory = ServerMemory(server.client.address)
         _report(server.client, "ant", MUG)
-        _report(server.client, "bee", far)
+        _report(server.client, "bee", beside)
         memory.edit(EditKind.MERGE, ID, "team/mug-2")
         [merged] = server.client.query_objects()
         assert [seen.agent_id for seen in merged.observers] == ["ant", "bee"]

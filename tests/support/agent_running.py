@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,6 +82,7 @@ def agent(
     queue_frames: int = 4,
     options: Sequence[str] = (),
     listen: str | None = None,
+    added: Callable[[MappingWorker, AgentMission], list[Service]] = lambda _worker, _mission: [],
 ) -> Iterator[Agent]:
     loops: list[asyncio.AbstractEventLoop] = []
     notifiers: list[ChangeNotifier] = []
@@ -107,7 +108,7 @@ def agent(
 
     try:
         with (
-            serving([Service("gausslite.v1.AgentService", register)], listen) as running,
+            serving([Service("gausslite.v1.AgentService", register), *added(worker, mission)], listen) as running,
             AgentClient(running.address) as client,
             grpc.insecure_channel(running.address) as channel,
         ):

@@ -36,7 +36,7 @@ from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.prior_map import PriorMap
-from gausslite.mission.run_records import RunRecords
+from gausslite.mission.run_records import open_records
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.pointing import pointed_masks
@@ -107,7 +107,9 @@ class MappingWorker:
         self._unpublished = empty_batch()
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
-        self._records = RunRecords()
+        self.records = open_records()
+        # returns the objects as people have corrected them; a service of `gausslite.agent_services` replaces it
+        self.edit_objects: Callable[[Sequence[ObjectLandmark]], tuple[ObjectLandmark, ...]] = tuple
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
@@ -145,6 +147,14 @@ class MappingWorker:
         return extended
 
     @_on_worker
+    def change_objects(self, change: Callable[[], bool]) -> None:
+        """Run a person's change of the objects; if it returns True, the task means others, and its region follows."""
+        if change() and self._task_mapper is not None:
+            self._task_mapper.assign()
+        if self._task_mapper is not None:
+            self._report_task(self._task_mapper)
+
+    @_on_worker
     def restore(self, saved: SavedMission) -> None:
         """Continue a saved mission; call it before the first frame. Raises MapFileError, StorageError."""
         checkpoint = saved.checkpoint
@@ -179,7 +189,8 @@ class MappingWorker:
     @_on_worker
     def write_records(self, folder: Path, keyframes: Sequence[Keyframe]) -> None:
         """Write what packages have recorded since the program's start. Raises StorageError."""
-        self._records.write(folder, keyframes)
+        for record in self.records:
+            record.write(folder, keyframes)
 
     @_on_worker
     def camera_view(self) -> CameraView | None:
@@ -234,10 +245,8 @@ class MappingWorker:
             return
         inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
         if inserted:
-            count = self.status().team_gaussians + inserted
-            self._status.update(
-                team_gaussians=count, gaussians=self._mapper.table.count, map_revision=self._map_revision()
-            )
+            count, gaussians = self.status().team_gaussians + inserted, self._mapper.table.count
+            self._status.update(team_gaussians=count, gaussians=gaussians, map_revision=self._map_revision())
             self._on_change()
 
     @_on_worker
@@ -286,7 +295,7 @@ class MappingWorker:
                 tracker=build_tracker(self._settings, self._mapper),
                 monitor=open_monitor(self._settings, self.prior, in_background=True),
             )
-        elif current is None or not graph.is_equivalent_to(current):
+        elif current is None or graph.context != current.context or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign
             change(self._build_estimator(graph))
         self._status.update(graph=graph)
@@ -348,7 +357,8 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.enqueue_newest(self._mapper.store.kept)
-        self._records.add(outcome, self._mapper.poses, self._mapper.gaussians)
+        for record in self.records:
+            record.add(outcome, self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
         self._count(report, outcome)
         self._on_change()
@@ -383,10 +393,11 @@ class MappingWorker:
             _log.warning("%s", note)
         self._status.update(notes=notes)
 
-    def _update_objects(self, objects: tuple[ObjectLandmark, ...]) -> None:
-        """Store the confirmed objects, and report them with the task to the fusion server."""
+    def _update_objects(self, found: tuple[ObjectLandmark, ...]) -> None:
+        """Store the confirmed objects, and report them with the task to the fusion server, as people corrected them."""
         assert self._task_mapper is not None
-        self._status.update(objects=objects, nouns=self._task_mapper.nouns)
+        objects = self.edit_objects(found)
+        self._status.update(objects=objects, found=found, nouns=self._task_mapper.nouns)
         graph = self.status().graph
         if self.uplink is not None and graph is not None:
             self.uplink.report_objects(ObjectReport(graph, objects))

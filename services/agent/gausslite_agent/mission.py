@@ -81,7 +81,6 @@ def mission_report(
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),
         "team_gaussians_inserted": status.team_gaussians,
-        "objects": [object_as_json(landmark) for landmark in status.objects],
         "nouns": [noun_as_json(noun) for noun in status.nouns],
         "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }
@@ -353,7 +352,7 @@ class AgentMission:
         report["notes"] = [*self._source_notes, *report["notes"]]
         prior = self._worker.prior
         keyframes = self._worker.run(lambda mapper: mapper.store.kept).result()
-        changes = compare_with_prior(prior, gaussians, self._worker.status().objects, keyframes)
+        changes = compare_with_prior(prior, gaussians, self._worker.status().found, keyframes)
         for line in changes.lines:
             _log.info("since the earlier map: %s", line)
         report |= {**changes.report, "objects": [object_as_json(landmark) for landmark in changes.objects]}

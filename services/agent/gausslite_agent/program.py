@@ -26,7 +26,7 @@ from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.pages import load_pages
-from gausslite.plugins import Group, load
+from gausslite.plugins import Group, installed, load
 from gausslite.process import ROBOT_LOST
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.run_service import run_service
@@ -176,7 +176,8 @@ async def _serve(settings: AgentSettings) -> int:
             page = load_pages("--view").service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls)
             stack.enter_context(page)
         run_mission = functools.partial(_run_mission, settings, mission, stream, first_parser)
-        await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
+        added = [create(worker, estimators, mission.save) for _, create in installed(Group.AGENT_SERVICES)]
+        await serve_until_stopped(settings.listen, [servicer.service(), *added], run_mission, settings.tls)
         lost = mission.describe_lost_data()
         if lost:
             _log.error("%s", lost)

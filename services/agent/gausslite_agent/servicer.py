@@ -47,13 +47,11 @@ from gausslite.wire.views import (
 )
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.messages import (
-    frame_report_to_message,
-    status_to_message,
-    summary_to_message,
-)
+from gausslite_agent.messages import frame_report_to_message, status_to_message, summary_to_message
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
+
+# ruff: noqa: N802 - the methods' names are those of the generated base class
 
 _OUTCOMES_AHEAD = 16
 _ENCODERS, _MAX_WATCHERS_WAITING = 2, 1024
@@ -169,7 +167,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         name = pb.DESCRIPTOR.services_by_name["AgentService"].full_name
         return Service(name, lambda server: pb_grpc.add_AgentServiceServicer_to_server(self, server))
 
-    async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
+    async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:
         """Assign a task, given as text or as a graph, and what a person points at."""
 
         def assign() -> TaskGraph:
@@ -177,7 +175,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
         return pb.AssignTaskResponse(graph=graph_to_message(await self._newest_task.assign(assign)))
 
-    async def IngestFrames(  # noqa: N802
+    async def IngestFrames(
         self, request_iterator: AsyncIterator[pb.IngestFramesRequest], _context: Any
     ) -> AsyncIterator[pb.IngestFramesResponse]:
         """Map a stream of frames; yield one outcome for each, in order."""
@@ -190,9 +188,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         finally:
             reader.cancel()
 
-    async def EndMission(  # noqa: N802
-        self, request: pb.EndMissionRequest, _context: Any
-    ) -> pb.EndMissionResponse:
+    async def EndMission(self, request: pb.EndMissionRequest, _context: Any) -> pb.EndMissionResponse:
         """End the mission; return what was sent and left."""
         end = self._mission.end_by_options
         if request.HasField("handover"):
@@ -202,15 +198,13 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         summary = await asyncio.get_running_loop().run_in_executor(self._ending, self._mission.end, end)
         return summary_to_message(self._mission.state, summary)
 
-    async def GetAgentStatus(  # noqa: N802
-        self, _request: pb.GetAgentStatusRequest, _context: Any
-    ) -> pb.GetAgentStatusResponse:
+    async def GetAgentStatus(self, _request: pb.GetAgentStatusRequest, _context: Any) -> pb.GetAgentStatusResponse:
         """Return the status of the robot and its uplink."""
         uplink = self._worker.uplink
         counters = UplinkCounters() if uplink is None else uplink.counters()
         return status_to_message(self._agent_id, self._mission, self._worker.status(), counters)
 
-    async def RenderView(self, request: pb.RenderViewRequest, context: Any) -> pb.RenderViewResponse:  # noqa: N802
+    async def RenderView(self, request: pb.RenderViewRequest, context: Any) -> pb.RenderViewResponse:
         """Render the map from a pose, one view at a time, when no frame waits."""
         camera = view_camera_from_message(request.camera)
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
@@ -225,17 +219,13 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
         return await self._views.run(context, work)
 
-    async def GetCameraView(  # noqa: N802
-        self, _request: pb.GetCameraViewRequest, context: Any
-    ) -> pb.GetCameraViewResponse:
+    async def GetCameraView(self, _request: pb.GetCameraViewRequest, context: Any) -> pb.GetCameraViewResponse:
         """Return the newest keyframe, the camera's path and the newest detection."""
         return await self._camera_views.run(
             context, lambda: camera_view_to_message(self._worker.camera_view().result())
         )
 
-    async def WatchMap(  # noqa: N802
-        self, request: pb.WatchMapRequest, context: Any
-    ) -> AsyncIterator[pb.WatchMapResponse]:
+    async def WatchMap(self, request: pb.WatchMapRequest, context: Any) -> AsyncIterator[pb.WatchMapResponse]:
         """Yield a snapshot of the map, then its changes. A slow reader gets merged changes; nothing is queued."""
         region = box_from_message(request.region) if request.HasField("region") else None
         change_log, grid = self._change_logs[request.roi_only], self._worker.grid

@@ -223,7 +223,8 @@ class WorkerStatus:
     notes: tuple[str, ...] = ()  # messages of the relevance estimator
     correction: PoseCorrection | None = None
     corrected_at_s: float = 0.0
-    objects: tuple[ObjectLandmark, ...] = ()  # the confirmed objects of the task
+    objects: tuple[ObjectLandmark, ...] = ()  # the confirmed objects, as people have corrected them
+    found: tuple[ObjectLandmark, ...] = ()  # the same before any correction
     nouns: tuple[NounReport, ...] = ()  # what is searched for each noun, and what was detected
     team_gaussians: int = 0  # Gaussians inserted from the fused map
     localisation: LocalisationState = LocalisationState.TRACKED  # of the robot

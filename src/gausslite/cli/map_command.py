@@ -43,7 +43,7 @@ from gausslite.mission.results import (
     write_poses,
     write_results,
 )
-from gausslite.mission.run_records import RunRecords
+from gausslite.mission.run_records import RunRecord, open_records
 from gausslite.mission.runner import MissionResult
 from gausslite.mission.schedule import TaskSchedule
 from gausslite.mission.settings import (
@@ -224,7 +224,7 @@ def run(options: argparse.Namespace) -> int:
 def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None]) -> int:
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
-        records = RunRecords()
+        records = open_records()
         mapped = _map_frames(options, run, draw, records)
         written = _write_results(options, mapped, records) if mapped.is_worth_keeping else None
     # an early end keeps the map so far; the exit code reports it
@@ -243,7 +243,7 @@ def _map(options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome
 
 
 def _map_frames(
-    options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None], records: RunRecords
+    options: argparse.Namespace, run: OpenRun, draw: Callable[[FrameOutcome], None], records: Sequence[RunRecord]
 ) -> MappedRun:
     """Map all frames with a bar. Raises DatasetError if frames exist and none of them can be used."""
     mapper = run.scheduled.mapper
@@ -251,7 +251,8 @@ def _map_frames(
 
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
-            records.add(outcome, mapper.poses, mapper.gaussians)
+            for record in records:
+                record.add(outcome, mapper.poses, mapper.gaussians)
             draw(outcome)
 
         mapped = run.map(print_above_bar, report, options.strict, options.save_state)
@@ -272,7 +273,7 @@ class _Written:
     scores: TrainingFit | None
 
 
-def _write_results(options: argparse.Namespace, mapped: MappedRun, records: RunRecords) -> _Written:
+def _write_results(options: argparse.Namespace, mapped: MappedRun, records: Sequence[RunRecord]) -> _Written:
     """Write map.ply, report.json, poses, keyframes, preview.png and the records of packages. Raises StorageError."""
     out, mapper, mission, prior = options.out, mapped.mapper, mapped.run.plan.mission, mapped.run.prior
     keyframes = mapper.keyframes()
@@ -297,7 +298,8 @@ def _write_results(options: argparse.Namespace, mapped: MappedRun, records: RunR
     write_results(out, mapped.gaussians, report, world_frame)
     write_poses(out, mapper.poses, None if prior is None else prior.motion)
     write_keyframes(out, keyframes)
-    records.write(out, keyframes)
+    for record in records:
+        record.write(out, keyframes)
     if evaluator is not None and views:
         write_png(out / PREVIEW, evaluator.preview(viewer, views))
     return _Written(report, notes, changes.lines, scores)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -52,6 +52,7 @@ class NounMatch:
     accepted: bool = True
     known: tuple[str, ...] = ()  # the ground truth's regions, or the classes near to a noun without one
     min_score: float | None = None  # from which a detection counts
+    is_there: Callable[[Float64[ndarray, "3"]], bool] | None = field(default=None, compare=False)  # where it can be
 
     @property
     def is_searched(self) -> bool:

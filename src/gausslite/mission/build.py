@@ -131,8 +131,8 @@ def build_task_mapper(
 class RememberingDetector(Detector, Protocol):
     """A detector that also remembers what else it sees, over all tasks of a mission."""
 
-    def remember(self, estimator: RelevanceEstimator, /) -> RelevanceEstimator:
-        """Return an estimator that reports these objects after its own, and has them in its state."""
+    def remember(self, estimator: RelevanceEstimator, graph: TaskGraph, /) -> RelevanceEstimator:
+        """Return a task's estimator that reports these objects after its own, and has them in its state."""
 
 
 OpenMemory = Callable[[Detector, UpAxis], RememberingDetector]
@@ -154,13 +154,19 @@ class EstimatorFactory:
         self._scene = functools.cache(scene)
         self._detector = chosen_detector(perception)
         self._executor: ThreadPoolExecutor | None = None
-        self._memory: RememberingDetector | None = None
 
     def in_scene(self, scene: Callable[[], SceneInfo]) -> EstimatorFactory:
         """Return a factory with the same detector for another scene."""
         other = copy.copy(self)
-        other._scene, other._memory = functools.cache(scene), None
+        other._scene = functools.cache(scene)
+        other.__dict__.pop("memory", None)
         return other
+
+    @functools.cached_property
+    def memory(self) -> RememberingDetector | None:
+        """What is remembered over all tasks; None if no package does."""
+        remember: OpenMemory | None = find(Group.OBJECT_MEMORIES)
+        return None if remember is None else remember(self._detector_or_truth(False), self._scene().up_axis)
 
     def require_detector(self) -> None:
         """Raise InvalidInputError if one is needed, and there is neither a model file nor ground truth."""
@@ -182,14 +188,12 @@ class EstimatorFactory:
         evidence = EvidenceSettings.accept_similar() if self._perception.accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         detector = self._detector_or_truth(bool(graph.queries))
-        if self._memory is None and (remember := find(Group.OBJECT_MEMORIES)) is not None:
-            self._memory = remember(detector, settings.up_axis)
-        detector = self._memory or detector
+        detector = self.memory or detector
         estimator: RelevanceEstimator = TaskRelevanceEstimator(graph, detector, settings)
         if self._detector is not None and self._perception.asynchronous:
             self._executor = self._executor or ThreadPoolExecutor(1, "detector")
             estimator = AsyncRelevanceEstimator(graph, detector, self._executor, settings)
-        return estimator if self._memory is None else self._memory.remember(estimator)
+        return estimator if self.memory is None else self.memory.remember(estimator, graph)
 
     def _detector_or_truth(self, is_needed: bool = True) -> Detector:
         if self._detector is not None:

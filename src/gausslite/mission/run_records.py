@@ -23,18 +23,6 @@ class RunRecord(Protocol):
         """Write the file after the last frame. keyframes: oldest first. Raises StorageError."""
 
 
-class RunRecords:
-    """The installed records of one run."""
-
-    def __init__(self) -> None:
-        self._records: list[RunRecord] = [create() for _, create in installed(Group.RUN_RECORDS)]
-
-    def add(self, outcome: FrameOutcome, poses: PoseTable, gaussians: Callable[[], Gaussians]) -> None:
-        """Add a processed frame to each record."""
-        for record in self._records:
-            record.add(outcome, poses, gaussians)
-
-    def write(self, folder: Path, keyframes: Sequence[Keyframe]) -> None:
-        """Write each record. Raises StorageError."""
-        for record in self._records:
-            record.write(folder, keyframes)
+def open_records() -> list[RunRecord]:
+    """Return the installed records of one run."""
+    return [create() for _, create in installed(Group.RUN_RECORDS)]

@@ -130,13 +130,13 @@ class TaskMapper:
         # a person takes seconds to point, while newer frames replace most of the newest keyframes
         self._shown: deque[Frame] = deque(maxlen=_MAX_SHOWN)
 
-    def assign(self, estimator: RelevanceEstimator) -> None:
-        """Switch to another task with the next frame.
+    def assign(self, estimator: RelevanceEstimator | None = None) -> None:
+        """Switch to another task with the next frame; None: the same, whose nouns mean other objects from now on.
 
         Earlier keyframes are re-evaluated, newest first and a few per frame. Voxels that were published for the old
         region stay published.
         """
-        self._estimator = estimator
+        self._estimator = estimator or self._estimator
         self._mapper.reset_roi()
         if self._sent_voxels is not None:
             self._sent_voxels.freeze_sent()
@@ -327,11 +327,8 @@ class TaskMapper:
 
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
-        return (
-            None
-            if self._sent_voxels is None
-            else self._sent_voxels.collect_changes(self._mapper.gaussians(active_only=True))
-        )
+        sent = self._sent_voxels
+        return None if sent is None else sent.collect_changes(self._mapper.gaussians(active_only=True))
 
     @property
     def loops(self) -> LoopCounts:

@@ -56,7 +56,7 @@ class Selector:
 
     def __init__(self, graph: TaskGraph, matches: Sequence[NounMatch], up: Float64[ndarray, "3"]) -> None:
         """matches: what the detector searches for the graph's nouns. up: the world's upward direction."""
-        self._up = up
+        self._up, self.places = up, {match.noun: match.is_there for match in matches}
 
     def observe(self, frame: Frame) -> None:
         """Measure what all objects need, such as the floor's level, on a frame with detections."""

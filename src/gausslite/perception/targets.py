@@ -63,7 +63,7 @@ class TargetSelector:
         a viewpoint, sides are evaluated as near.
         """
         observation = replace(landmark.seen_from(np.zeros(3)), camera_m=None)
-        if self._given_name(landmark) or self.target_of(observation) is not None:
+        if self._is_meant(landmark) and (self._given_name(landmark) or self.target_of(observation) is not None):
             return ObjectRole.TARGET
         is_anchor = landmark.phrase in map(noun_of, self._graph.anchors) or landmark.phrase not in self._names
         return ObjectRole.ANCHOR if is_anchor else ObjectRole.OTHER
@@ -102,13 +102,18 @@ class TargetSelector:
         named = [
             (landmark, self._given_name(landmark) or self.target_of(landmark.seen_from(T_world_camera[:3, 3])))
             for landmark in confirmed
-            if not self.is_excluded(landmark)
+            if self._is_meant(landmark) and not self.is_excluded(landmark)
         ]
         return {target: [landmark for landmark, name in named if name == target] for target in self._graph.targets}
 
     def is_excluded(self, landmark: Landmark) -> bool:
         """Return True if a person has excluded this object."""
         return any(landmark.contains(point_m) for point_m in self.excluded_m)
+
+    def _is_meant(self, landmark: Landmark) -> bool:
+        """Return False where people have said that no object of its noun is meant, unless they point at it."""
+        is_there = self._selector.places.get(landmark.phrase)
+        return landmark.is_given or is_there is None or is_there(landmark.centroid_m)
 
     def _given_name(self, landmark: Landmark) -> str | None:
         """Return the target of an object that a person has pointed at; None for other objects."""

@@ -17,6 +17,7 @@ from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.wire.clients import AgentClient
 from gausslite_evaluation.metrics import psnr
+from gausslite_objects.memory_client import ServerMemory
 from gausslite_view.pages import live_page, own_address
 
 pytest.importorskip("viser")
@@ -98,7 +99,7 @@ def test_a_wrong_task_is_reported_on_the_page(robot: Agent):
 
 def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe(robot: Agent):
     page, client = SeenPage(), AgentClient(robot.client.address)
-    panel = AgentPanel(page, client)
+    panel = AgentPanel(page, client, ServerMemory(client.address))
     try:
         robot.client.assign_task(TASK)
         for index in range(3):
