@@ -233,7 +233,8 @@ def box_distance_m(one: ObjectLandmark, other: ObjectLandmark) -> float:
 
 def is_denied(edits: Sequence[Edit], noun: str, point_m: tuple[float, float, float]) -> bool:
     """Return True if people have deleted what a detector calls by a noun at a point, or have renamed it."""
-    probe = ObjectLandmark(_PROBE, noun, ObjectRole.OTHER, point_m, AxisAlignedBox(point_m, point_m), 1.0, 0, 0)
+    box, role = AxisAlignedBox(point_m, point_m), ObjectRole.OTHER
+    probe = ObjectLandmark(_PROBE, noun, role, point_m, box, confidence=1.0, first_seen_ns=0, last_seen_ns=0)
     return not any(found.object_id == _PROBE and found.noun == noun for found in apply_edits([probe], edits).objects)
 
 
