@@ -31,6 +31,7 @@ from gausslite.domain.voxels import (
 )
 from gausslite.v1 import agent_service_pb2 as agent
 from gausslite.v1 import fusion_service_pb2 as fusion
+from gausslite.v1 import geometry_pb2
 from gausslite.v1 import parser_service_pb2 as parser
 from gausslite.wire import convert
 from gausslite.wire.convert_task import graph_to_message, report_to_message
@@ -72,7 +73,7 @@ def codec_messages() -> Iterator[tuple[str, str, bytes]]:
 def fusion_messages() -> Iterator[tuple[str, str, Message]]:
     """Yield the requests of the fusion server."""
     join = fusion.JoinSessionRequest(
-        agent_id="other", mission_id="mission", grid=convert.grid_to_message(GRID), token="t"
+        agent_id="other", mission_id="mission", grid=geometry_pb2.VoxelGrid(size_m=GRID.size_m), token="t"
     )
     yield "FusionService.JoinSession", "plain", join
     join.fresh_map, join.world_frame = True, "kitchen"
@@ -158,7 +159,7 @@ def frames(lens: Lens | None = None) -> Iterator[tuple[str, Message]]:
     yield "lossless", convert.frame_to_message(plain, lossless=True)
     motion = CameraMotion(Twist(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.2, 0.0])), 0.02, 0.01)
     moving = Frame(2, 2_000_000, rgb, plain.depth_m, CAMERA, np.eye(4), motion)
-    yield "moving", convert.live_frame_to_message(moving, lens)
+    yield "moving", convert.frame_to_message(moving, lens=lens)
 
 
 def report() -> ObjectReport:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+import asyncio
+from collections.abc import AsyncIterator, Iterable, Sequence
 from typing import Self
 
 import grpc
@@ -116,6 +117,19 @@ class UpdateStream:
 
     def _request(self, subset: bytes, sequence: int) -> pb.ContributeSubsetsRequest:
         return pb.ContributeSubsetsRequest(session_id=self._session_id, sequence=sequence, subset=subset)
+
+
+def send_all(address: str, session_id: str, subsets: Iterable[bytes]) -> None:
+    """Send encoded subsets of a session, one after the other. Raises CodecError for one that is not accepted."""
+
+    async def send() -> None:
+        async with UpdateStreams(address) as streams:
+            stream = streams.open(session_id)
+            for subset in subsets:
+                await stream.send(subset)
+            await stream.close()
+
+    asyncio.run(send())
 
 
 class UpdateStreams(_Connection):

@@ -29,6 +29,7 @@ from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.choose import choose_rasterizer
+from gausslite_bench.cli.study_options import names_among
 from gausslite_bench.quality.real_scenes import REAL_CAMERA
 from gausslite_bench.report import Report
 from gausslite_evaluation.compare import evaluate
@@ -80,16 +81,14 @@ class KidnapSettings:
 
     source: str = option("sim:home", "the recording", metavar="ADDRESS")
     elsewhere: str = option("sim:home-2", "another one, of a place that the map does not have", metavar="ADDRESS")
-    events: tuple[str, ...] = option(tuple(EVENTS), f"among {', '.join(EVENTS)}", metavar="A,B")
+    events: tuple[str, ...] = option(
+        tuple(EVENTS), f"among {', '.join(EVENTS)}", metavar="A,B", convert=names_among(EVENTS)
+    )
     frames: int = option(48, "frames before the event", low=12)
     after: int = option(16, "frames after it", low=4)
     stride: int = option(1, "every n-th frame of the recording", low=1)
     width: int = option(160, "of the images, in pixels", low=64)
     iterations: int = option(8, "of training for each frame", low=0)
-
-    def __post_init__(self) -> None:
-        if unknown := {*self.events} - {*EVENTS}:
-            raise InvalidInputError(f"--events: expected some of {', '.join(EVENTS)}, got {min(unknown)!r}")
 
 
 class _TimedMonitor(FrameMonitor):
@@ -117,48 +116,7 @@ class _TimedMonitor(FrameMonitor):
         return is_confirmed
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Recording:
-    """The frames of both places, with times that go on."""
-
-    source: Source
-    elsewhere: Source
-    settings: KidnapSettings
-
-    def before(self) -> Frames:
-        """Return the frames before each event."""
-        return self._frames(self.source, 0, self.settings.frames, 0)
-
-    def after(self, follow: str) -> Frames:
-        """Return the frames that follow."""
-        count = self.settings.frames
-        if follow == "way":
-            return self._frames(self.source, count, self.settings.after, count)
-        source, first = (self.source, count // 4) if follow == "seen" else (self.elsewhere, 0)
-        rng = np.random.default_rng(0)
-        return [
-            replace(frame, rgb=np.clip(frame.rgb + rng.normal(0, _NOISE, frame.rgb.shape), 0, 255).astype(np.uint8))
-            for frame in self._frames(source, first, self.settings.after, count)
-        ]
-
-    def _frames(self, source: Source, first: int, count: int, index: int) -> Frames:
-        stride = self.settings.stride
-        if (first + count) * stride > len(source):
-            raise InvalidInputError(
-                f"{source.name}: expected at least {(first + count) * stride} frames, got {len(source)}; "
-                "use fewer --frames, --after or a smaller --stride"
-            )
-        camera = source.camera.narrower(self.settings.width)
-        size = camera.width_px, camera.height_px
-        step_ns = round(1e9 * stride * float(np.median(np.diff(self.source.trajectory().times_s))))
-        return [
-            replace(source.frame((first + i) * stride, size), index=index + i, capture_time_ns=(index + i) * step_ns)
-            for i in range(count)
-        ]
-
-
 def _is_wrong(T: Poses, T_true: Poses) -> bool:
-    """True if a pose is wrong."""
     return translation_m(T, T_true) > _WRONG_M or rotation_angle_deg(T, T_true) > _WRONG_DEG
 
 
@@ -190,15 +148,23 @@ def _after_event(
 class _Trials:
     """The missions of a recording; those of the same frames at their own poses are mapped once."""
 
-    def __init__(self, recording: _Recording) -> None:
-        self._recording, self._before = recording, recording.before()
-        self._prior = PoseExposurePrior() if recording.source.poses_exact else REAL_CAMERA
+    def __init__(self, settings: KidnapSettings) -> None:
+        self._settings = settings
+        self._source, self._elsewhere = open_source(settings.source), open_source(settings.elsewhere)
+        for source, first in ((self._source, settings.frames), (self._elsewhere, 0)):
+            if (needed := (first + settings.after) * settings.stride) > len(source):
+                raise InvalidInputError(
+                    f"{source.name}: expected at least {needed} frames, got {len(source)}; "
+                    "use fewer --frames, --after or a smaller --stride"
+                )
+        self._before = self._frames(self._source, 0, settings.frames, 0)
+        self._prior = PoseExposurePrior() if self._source.poses_exact else REAL_CAMERA
         self._references: dict[str, float] = {}
 
     def run(self, name: str, is_watched: bool) -> dict[str, Any]:
         """Return the figures of an event."""
         event = EVENTS[name]
-        after, is_known = self._recording.after(event.follow), event.follow != "elsewhere"
+        after, is_known = self._after(event.follow), event.follow != "elsewhere"
         monitor = _TimedMonitor() if is_watched else None
         mission = self._mission(monitor)
         outcomes = [mission.process(frame) for frame in self._before]
@@ -220,6 +186,29 @@ class _Trials:
             "watching_share": watching,
         }
 
+    def _after(self, follow: str) -> Frames:
+        """Return the frames that follow; those of a place that was seen before have other noise now."""
+        count, after = self._settings.frames, self._settings.after
+        if follow == "way":
+            return self._frames(self._source, count, after, count)
+        source, first = (self._source, count // 4) if follow == "seen" else (self._elsewhere, 0)
+        rng = np.random.default_rng(0)
+        return [
+            replace(frame, rgb=np.clip(frame.rgb + rng.normal(0, _NOISE, frame.rgb.shape), 0, 255).astype(np.uint8))
+            for frame in self._frames(source, first, after, count)
+        ]
+
+    def _frames(self, source: Source, first: int, count: int, index: int) -> Frames:
+        """Return frames with numbers from `index` on, and with times that go on."""
+        stride = self._settings.stride
+        camera = source.camera.narrower(self._settings.width)
+        size = camera.width_px, camera.height_px
+        step_ns = round(1e9 * stride * float(np.median(np.diff(self._source.trajectory().times_s))))
+        return [
+            replace(source.frame((first + i) * stride, size), index=index + i, capture_time_ns=(index + i) * step_ns)
+            for i in range(count)
+        ]
+
     def _odometry(self, event: _Event, after: Frames) -> Frames:
         T_odometry_world = event.T_odometry_world(self._before[-1], after)
         return [
@@ -232,8 +221,7 @@ class _Trials:
         ]
 
     def _mission(self, monitor: FrameMonitor | None = None) -> TaskMapper:
-        iterations = self._recording.settings.iterations
-        settings = MissionSettings(policy="uniform", iterations=iterations, pose_prior=self._prior)
+        settings = MissionSettings(policy="uniform", iterations=self._settings.iterations, pose_prior=self._prior)
         return TaskMapper(NoTaskEstimator(), build_mapper(settings), monitor=monitor)
 
     def _reference(self, follow: str, after: Frames) -> float:
@@ -257,7 +245,7 @@ def run_kidnaps(settings: KidnapSettings) -> Report:
     noticed, found: number of the first frame after the event that is not mapped as before, and that is mapped right.
     wrong: frames that are mapped at a wrong pose, wrong_gs: Gaussians that these add. psnr: of the frames before it.
     """
-    trials = _Trials(_Recording(open_source(settings.source), open_source(settings.elsewhere), settings))
+    trials = _Trials(settings)
     rows = []
     with progress_bar(2 * len(settings.events), "kidnaps", "mission") as progress:
         for name in settings.events:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from contextlib import closing
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from gausslite.cli.main import main
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite_bench.chaos.acknowledged import AgentAcknowledgements, StoreComparison, compare_store, offline_map
-from gausslite_bench.chaos.journal import Journal, JournalRecord, RecordKind
+from gausslite_bench.chaos.agent import Record, RecordKind
 
 
 @pytest.mark.slow
@@ -30,16 +32,13 @@ def test_nothing_acknowledged_is_lost_in_a_short_run(capsys: pytest.CaptureFixtu
     assert 0 < result["fused_voxels"] <= result["voxels"]
 
 
-def acknowledged_by(journal: Path, *messages: bytes) -> AgentAcknowledgements:
+def acknowledged_by(*messages: bytes) -> AgentAcknowledgements:
     """Return the state after these messages were sent and stored."""
-    writer = Journal(journal)
-    for number, data in enumerate(messages):
-        writer.write(JournalRecord(RecordKind.SENT, number, data))
-    for number in range(len(messages)):
-        writer.write(JournalRecord(RecordKind.STORED, number))
     agent = AgentAcknowledgements()
-    agent.add_journal(journal)
-    agent.read()
+    for number, data in enumerate(messages):
+        agent.note(Record(RecordKind.SENT, number, data))
+    for number in range(len(messages)):
+        agent.note(Record(RecordKind.STORED, number))
     return agent
 
 
@@ -64,35 +63,32 @@ def test_a_store_without_an_acknowledged_update_is_found(
         if deleted:
             db.execute(f"DELETE FROM voxel_updates WHERE number = (SELECT {deleted}(number) FROM voxel_updates)")
             db.commit()
-    assert (
-        compare_store({"ant": acknowledged_by(tmp_path / "journal", first, second)}, tmp_path / "store.sqlite")
-        == expected
-    )
+    assert compare_store({"ant": acknowledged_by(first, second)}, tmp_path / "store.sqlite") == expected
 
 
 def test_a_store_with_other_content_of_an_acknowledged_update_is_found(tmp_path: Path) -> None:
     expected, other = (encode_subset(make_subset("ant", 5, {0: [kappa]}), GRID) for kappa in (1, 2))
     with closing(SqliteStore(tmp_path / "store.sqlite")) as store:
         store.put(decode_subset(other)[0])
-    compared = compare_store({"ant": acknowledged_by(tmp_path / "journal", expected)}, tmp_path / "store.sqlite")
+    compared = compare_store({"ant": acknowledged_by(expected)}, tmp_path / "store.sqlite")
     assert compared == StoreComparison(1, 0, 1, 0)
 
 
-def test_the_offline_map_has_the_winners_of_the_acknowledged_updates(tmp_path: Path) -> None:
-    ant = acknowledged_by(tmp_path / "ant", encode_subset(make_subset("ant", 1, {0: [1], 1: [9]}), GRID))
-    bee = acknowledged_by(tmp_path / "bee", encode_subset(make_subset("bee", 1, {0: [5]}), GRID))
+def test_the_offline_map_has_the_winners_of_the_acknowledged_updates() -> None:
+    ant = acknowledged_by(encode_subset(make_subset("ant", 1, {0: [1], 1: [9]}), GRID))
+    bee = acknowledged_by(encode_subset(make_subset("bee", 1, {0: [5]}), GRID))
     fused = offline_map({"ant": ant, "bee": bee, "cat": AgentAcknowledgements()})
     assert fused.batch.kappa_sums.tolist() == [5, 9]
 
 
-def test_a_record_without_its_end_is_read_when_it_is_complete(tmp_path: Path) -> None:
-    agent = acknowledged_by(tmp_path / "journal", encode_subset(make_subset("ant", 1, {0: [1]}), GRID))
-    data = (tmp_path / "journal").read_bytes()
-    (tmp_path / "torn").write_bytes(data[:-3])
-    torn = AgentAcknowledgements()
-    torn.add_journal(tmp_path / "torn")
-    torn.read()
-    assert torn.messages == 0
-    (tmp_path / "torn").write_bytes(data)
-    torn.read()
-    assert torn.messages == agent.messages == 1
+def test_a_part_of_a_record_of_a_killed_process_is_left_out() -> None:
+    agent, (records, pipe) = AgentAcknowledgements(), Pipe()
+    agent.follow(records)
+    pipe.send(Record(RecordKind.SENT, 0, encode_subset(make_subset("ant", 1, {0: [1]}), GRID)))
+    agent.read()
+    assert agent.messages == 0
+    pipe.send(Record(RecordKind.STORED, 0))
+    os.write(pipe.fileno(), b"\0\0\0\x20half")
+    pipe.close()
+    agent.read()
+    assert agent.messages == 1

@@ -9,7 +9,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
-from gausslite_bench.raster.procedural_room import seed_rows
+from gausslite_bench.raster.room import seed_rows
 from gausslite_bench.team.scenes import HomeTeamPlan
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
@@ -40,7 +40,7 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "kidnaps", "raster", "server")
         (("server", "--held", "many"), "--held"),
         (("server", "--agents", "0"), "--agents"),
         (("server", "--seconds", "0"), "--seconds"),
-        (("server", "--hostile", "unknown"), "--hostile: expected all, or some of busy"),
+        (("server", "--hostile", "unknown"), "--hostile: expected some of all, busy"),
         (("team", "--homes", "9"), "homes"),
         (("team", "--homes", "x"), "homes"),
         (("team", "--team-sizes", "7"), "agents"),

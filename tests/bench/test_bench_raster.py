@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
+from gausslite.domain.pose import inverse
 from gausslite_bench.raster.operation_costs import operation_times
-from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
+from gausslite_bench.raster.room import held_out_frame, seed_rows
 
+pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
 from gausslite.render.cpu import CpuRasterizer, usable_simd
@@ -18,9 +20,9 @@ from gausslite.render.cpu import CpuRasterizer, usable_simd
 OPERATIONS = {"fused_l1", "fused_l1_ssim", "region", "forward", "forward_backward"}
 
 
-def test_seed_rows_render_the_held_out_view() -> None:
-    view = held_out_view(96, 72)
-    rendering = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, view.T_camera_world)
+def test_seed_rows_render_the_held_out_frame() -> None:
+    view = held_out_frame(96, 72)
+    rendering = CpuRasterizer(threads=1).forward(seed_rows(30_000), view.camera, inverse(view.T_world_camera))
     seen = rendering.alpha > 0.9
     assert seen.mean() > 0.7
     assert np.median(np.abs(rendering.expected_depth_m() - view.depth_m)[seen]) < 0.03
@@ -44,7 +46,7 @@ def test_another_backend_is_measured_alike() -> None:
 
     from gausslite_gpu.rasterizer import CudaRasterizer
 
-    times = operation_times(CudaRasterizer(TorchKernels()), 60, held_out_view(48, 32), 1)
+    times = operation_times(CudaRasterizer(TorchKernels()), 60, held_out_frame(48, 32), 1)
     assert set(times) == OPERATIONS
 
 

@@ -39,8 +39,8 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
 
 def test_four_agents_of_a_home_see_different_views() -> None:
     scene = HomeTeamPlan(4, agents=4, frames=6, views=1).load((32, 24))
-    walks = [np.array([frame.T_world_camera for frame in agent.frames]) for agent in scene.agents]
-    assert [agent.task for agent in scene.agents[:3]] != [scene.agents[0].task] * 3
+    walks = [np.array([frame.T_world_camera for frame in agent.training]) for agent in scene.values()]
+    assert len({agent.task for agent in scene.values()}) > 1
     for first, second in itertools.combinations(walks, 2):
         distances_m = np.linalg.norm(first[:, None, :3, 3] - second[None, :, :3, 3], axis=-1)
         assert np.median(distances_m.min(axis=1)) > 0.01

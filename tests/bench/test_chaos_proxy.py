@@ -49,12 +49,12 @@ def test_a_stalled_connection_gets_everything_when_it_is_healed(proxy: FaultProx
     with connect(proxy, "ant") as ant:
         ant.sendall(b"1")
         assert ant.recv(1) == b"1"
-        proxy.stall("ant")
+        proxy.set_fault("ant", is_stalled=True)
         ant.sendall(b"2")
         ant.settimeout(0.2)
         with pytest.raises(TimeoutError):
             ant.recv(1)
-        proxy.clear_faults("ant")
+        proxy.set_fault("ant")
         ant.settimeout(WAIT_S)
         assert ant.recv(1) == b"2"
 
@@ -63,13 +63,13 @@ def test_a_cut_connection_is_reset_and_the_others_stay(proxy: FaultProxy) -> Non
     with connect(proxy, "ant") as ant, connect(proxy, "bee") as bee:
         ant.sendall(b"1")
         assert ant.recv(1) == b"1"
-        proxy.cut("ant")
+        proxy.set_fault("ant", is_cut=True)
         assert ant.recv(1) == b""
         bee.sendall(b"3")
         assert bee.recv(1) == b"3"
     with connect(proxy, "ant") as refused:
         assert refused.recv(1) == b""
-    proxy.clear_faults("ant")
+    proxy.set_fault("ant")
     with connect(proxy, "ant") as again:
         again.sendall(b"4")
         assert again.recv(1) == b"4"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import astuple, dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.vote import FusedMap, fuse
-from gausslite_bench.chaos.journal import JournalReader, RecordKind
+from gausslite_bench.chaos.agent import Record, RecordKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,29 +47,34 @@ class StoreComparison:
 class AgentAcknowledgements:
     """What one agent has sent, and the latest acknowledged content of each voxel."""
 
-    reader: JournalReader | None = None
     voxels: dict[int, StoredVoxel] = field(default_factory=dict)
     messages: int = 0
     updates: int = 0
+    _records: Connection | None = None
     _waiting: dict[int, bytes] = field(default_factory=dict)
 
-    def add_journal(self, path: Path) -> None:
-        """Follow the journal of a new process of this agent."""
+    def follow(self, records: Connection) -> None:
+        """Follow the records of a new process of this agent, after the last ones of the process before."""
         self.read()
         self._waiting.clear()
-        self.reader = JournalReader(path)
+        self._records = records
 
     def read(self) -> None:
-        """Read the new records of the journal."""
-        for record in () if self.reader is None else self.reader.new_records():
-            match record.kind:
-                case RecordKind.SENT:
-                    self._waiting[record.sequence] = record.subset
-                case RecordKind.STORED:
-                    self._acknowledge(self._waiting.pop(record.sequence))
-                case RecordKind.REFUSED:
-                    # the agent sends its content again, in a new message
-                    self._waiting.pop(record.sequence)
+        """Note the records that have arrived."""
+        # of the last one, a killed process may have written a part only
+        with suppress(EOFError, OSError):
+            while self._records is not None and self._records.poll():
+                self.note(self._records.recv())
+
+    def note(self, record: Record) -> None:
+        """Count a message as sent, acknowledged or refused."""
+        if record.kind is RecordKind.SENT:
+            self._waiting[record.sequence] = record.subset
+            return
+        # the agent sends what was refused again, in a new message
+        message = self._waiting.pop(record.sequence)
+        if record.kind is RecordKind.STORED:
+            self._acknowledge(message)
 
     def batch(self) -> VoxelBatch:
         """Return the latest acknowledged content, with tombstones."""

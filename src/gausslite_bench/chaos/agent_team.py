@@ -2,73 +2,69 @@
 
 from __future__ import annotations
 
-import itertools
-import json
-import subprocess
-import sys
+import multiprocessing
+import time
 from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from gausslite.domain.errors import UnavailableError
+from gausslite_bench.chaos import agent
 from gausslite_bench.chaos.acknowledged import AgentAcknowledgements
-from gausslite_bench.chaos.agent_process import DRAIN_S
 
-_END_S = DRAIN_S + 60.0
+_END_S, _POLL_S = agent.DRAIN_S + 60.0, 0.05
+# a fork would share gRPC's threads and sockets
+_SPAWN = multiprocessing.get_context("spawn")
 
 
 class AgentTeam:
-    """Owns one process per agent. The spools and journals are files in `folder`."""
+    """Owns one process per agent. The spools and the log are files in `folder`."""
 
     def __init__(self, folder: Path, names: Sequence[str], address_of: Callable[[str], str]) -> None:
         self._folder, self._address_of = folder, address_of
         self.acknowledged = {name: AgentAcknowledgements() for name in names}
-        self._lives = {name: itertools.count() for name in names}
-        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._processes: dict[str, tuple[multiprocessing.process.BaseProcess, Connection]] = {}
 
     @property
     def messages(self) -> int:
         """Acknowledged messages of all agents until now."""
         self.read()
-        return sum(journal.messages for journal in self.acknowledged.values())
+        return sum(acknowledged.messages for acknowledged in self.acknowledged.values())
 
     def read(self) -> None:
-        """Read the new records of all journals."""
-        for journal in self.acknowledged.values():
-            journal.read()
+        """Read the new records of all agents."""
+        for acknowledged in self.acknowledged.values():
+            acknowledged.read()
 
     def start(self, agent_id: str, seed: int) -> None:
         """Start an agent on its spool."""
-        journal = self._folder / f"{agent_id}-{next(self._lives[agent_id])}.journal"
-        spool = self._folder / f"{agent_id}.spool"
-        settings = agent_id, self._address_of(agent_id), str(spool), str(journal), seed
-        self.acknowledged[agent_id].add_journal(journal)
-        command = [sys.executable, "-m", "gausslite_bench.chaos.agent_process", json.dumps(settings)]
-        with (self._folder / "agents.log").open("ab") as log:
-            self._processes[agent_id] = subprocess.Popen(  # noqa: S603 - this program
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
-            )
+        own, pipe = _SPAWN.Pipe()
+        self.acknowledged[agent_id].follow(own)
+        arguments = agent_id, self._address_of(agent_id), self._folder, seed, pipe
+        process = _SPAWN.Process(target=agent.run, args=arguments, daemon=True)
+        process.start()
+        pipe.close()  # else its end would stay open when the process ends
+        self._processes[agent_id] = process, own
 
     def kill(self, agent_id: str) -> None:
         """End an agent's process at once."""
-        process = self._processes.pop(agent_id)
+        process, _ = self._processes.pop(agent_id)
         process.kill()
-        process.communicate()
+        process.join()
 
     def finish(self) -> None:
         """Let every agent send what it has left, and end. Raises UnavailableError if one cannot."""
-        for process in self._processes.values():
-            if process.stdin is not None:
-                process.stdin.close()
-                process.stdin = None
-        for agent_id, process in self._processes.items():
-            try:
-                output, _ = process.communicate(timeout=_END_S)
-            except subprocess.TimeoutExpired:
-                output = ""
-            end = json.loads(output or "{}")
-            if not end.get("drained"):
-                reason = end.get("stopped_because") or f"not everything was acknowledged within {_END_S:.0f} s"
-                raise UnavailableError(f"{agent_id}: expected it to send everything at the end: {reason}")
+        for _, pipe in self._processes.values():
+            pipe.send("end")
+        limit_s = time.monotonic() + _END_S
+        for agent_id, (process, _) in self._processes.items():
+            # they wait while nobody reads their records
+            while process.is_alive() and time.monotonic() < limit_s:
+                self.read()
+                process.join(_POLL_S)
+            if process.exitcode != 0:
+                log = (self._folder / agent.LOG).read_text(errors="replace")[-500:]
+                raise UnavailableError(f"{agent_id}: expected it to send everything at the end: {log}")
         self.read()
 
     def close(self) -> None:

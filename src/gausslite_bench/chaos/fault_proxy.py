@@ -73,17 +73,17 @@ class FaultProxy:
         """Return where the agent has to connect."""
         return f"unix:{self._links[agent_id].path}"
 
-    def cut(self, agent_id: str) -> None:
-        """Reset the agent's connections and refuse new ones."""
-        self._set(agent_id, is_cut=True)
+    def set_fault(self, agent_id: str, is_cut: bool = False, is_stalled: bool = False) -> None:
+        """Set the faults of the agent's connections, by default none.
 
-    def stall(self, agent_id: str) -> None:
-        """Stop forwarding without closing a connection, as when packets are lost."""
-        self._set(agent_id, is_stalled=True)
+        is_cut: reset them and refuse new ones. is_stalled: forward nothing without closing them, as when packets are
+        lost.
+        """
 
-    def clear_faults(self, agent_id: str) -> None:
-        """End all faults of the agent's connections."""
-        self._set(agent_id)
+        async def apply() -> None:
+            self._links[agent_id].set_fault(is_cut, is_stalled)
+
+        self._run(apply())
 
     def close(self) -> None:
         """Close all connections and end the thread."""
@@ -101,12 +101,6 @@ class FaultProxy:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-    def _set(self, agent_id: str, is_cut: bool = False, is_stalled: bool = False) -> None:
-        async def apply() -> None:
-            self._links[agent_id].set_fault(is_cut, is_stalled)
-
-        self._run(apply())
 
     def _run(self, coroutine: Coroutine[object, object, _Result]) -> _Result:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(30)

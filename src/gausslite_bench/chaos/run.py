@@ -54,7 +54,7 @@ class ChaosSettings:
     kills: int = option(200, "kills and partitions", low=1)
     agents: int = option(4, "agents that send", low=1, high=32)
     seed: int = option(0, "seed of all faults (default: 0)", low=0)
-    out: Path | None = option(None, "keep the store, the journals and the logs there (default: no)", metavar="FOLDER")
+    out: Path | None = option(None, "keep the store, the spools and the logs there (default: no)", metavar="FOLDER")
 
 
 def run_chaos(settings: ChaosSettings) -> Report:
@@ -119,9 +119,9 @@ class _ChaosRun:
                 self.team.kill(agent_id)
                 self._start_agent(agent_id)
             case _:
-                (self.proxy.cut if fault is Fault.CUT else self.proxy.stall)(agent_id)
+                self.proxy.set_fault(agent_id, is_cut=fault is Fault.CUT, is_stalled=fault is Fault.STALL)
                 threading.Event().wait(self._random.uniform(0.1, _MAX_FAULT_S))
-                self.proxy.clear_faults(agent_id)
+                self.proxy.set_fault(agent_id)
 
     def _kill_server(self) -> None:
         self._peak_mib = max(self._peak_mib, self.server.rss_mib())

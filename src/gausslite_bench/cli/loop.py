@@ -41,9 +41,8 @@ _HOME = "sim:home?seed=0&trajectory=0"
 _HOME_TASK = "Pick up the mug on the table"
 
 
-def configure_loop(parser: CommandParser) -> None:
+def add_loop_options(parser: CommandParser) -> None:
     """Add the options of `bench loop`."""
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     Program.of(
         *(RecordingOptions, SourceSettings, TaskSettings, PerceptionSettings, MissionSettings),
         flags="frames size task detector roi objects policy max-gaussians iterations rate seed",
@@ -51,11 +50,10 @@ def configure_loop(parser: CommandParser) -> None:
         omit=("test-every",),
         defaults={"source": _HOME},
     ).add_to(parser)
-    parser.set_defaults(run=run_loop)
 
 
-def run_loop(options: argparse.Namespace) -> int:
-    """Map the sequence and print the time of each stage. Reading frames is not counted."""
+def run_loop(options: argparse.Namespace) -> Report:
+    """Map the sequence and return the time of each stage. Reading frames is not counted."""
     has_task = options.task or options.roi or options.objects or options.target_at
     if options.source == _HOME and options.policy == TASK and not has_task:
         options.task = _HOME_TASK
@@ -64,7 +62,7 @@ def run_loop(options: argparse.Namespace) -> int:
     source, options.pose_prior = calibration.source, calibration.pose_prior
     positions = select_frames(source, options.frames)
     figures = _map_frames(options, source, positions)
-    report = {
+    values = {
         "source": options.source,
         "task": options.task,
         "size": list(frame_size(options.size, source)),
@@ -73,8 +71,7 @@ def run_loop(options: argparse.Namespace) -> int:
         "frames_skipped": len(positions) - int(str(figures["frames"])),
         "peak_rss_mib": peak_rss_mib(),
     }
-    print(Report(report).text(options.json))
-    return 0
+    return Report(values)
 
 
 def _estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:

@@ -13,16 +13,14 @@ from gausslite_bench.parser_scores import SENTENCES, load_sentences, score_parse
 from gausslite_bench.report import Report
 
 
-def configure_parser(parser: CommandParser) -> None:
+def add_parser_options(parser: CommandParser) -> None:
     """Add the options of `bench parser`."""
     sentences_help = "sentences with their expected graphs (default: the set in the package)"
     parser.add_argument("--sentences", type=Path, default=SENTENCES, metavar="FILE.json", help=sentences_help)
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     Program.of(*parser_options(), flags="backend llm-model llm-url").add_to(parser)
-    parser.set_defaults(run=_run_parser)
 
 
-def _run_parser(options: argparse.Namespace) -> int:
+def run_parser(options: argparse.Namespace) -> Report:
+    """Parse each sentence and return the scores."""
     score = score_parser(chosen_parser(options).open(), load_sentences(options.sentences))
-    print(Report({"backend": options.backend, **asdict(score)}).text(options.json))
-    return 0
+    return Report({"backend": options.backend, **asdict(score)})

@@ -45,20 +45,18 @@ class PerceptionBenchOptions:
     threads: int | None = option(None, "the detector's threads (default: the runtime's choice)", low=1)
 
 
-def configure_perception(parser: CommandParser) -> None:
+def add_perception_options(parser: CommandParser) -> None:
     """Add the options of `bench perception`."""
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     Program.of(
         *(PerceptionBenchOptions, RecordingOptions, SourceSettings, PerceptionSettings),
         flags="detector frames size roi task",
         positional="source",
         omit=("test-every", "camera-correction", "pose-prior"),
     ).add_to(parser)
-    parser.set_defaults(run=run_perception)
 
 
-def run_perception(options: argparse.Namespace) -> int:
-    """Run every task on every frame and print the scores of each stage."""
+def run_perception(options: argparse.Namespace) -> Report:
+    """Run every task on every frame and return the scores of each stage."""
     detector = chosen_detector(build(PerceptionSettings, options, threads=options.threads))
     if detector is None:
         raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")
@@ -72,8 +70,7 @@ def run_perception(options: argparse.Namespace) -> int:
     bench = PerceptionBench(detector, _task_queries(options.task, regions), regions, source.up_axis)
     for position in positions:
         bench.process(source.frame(position, size))
-    print(Report({"tasks": [asdict(score) for score in bench.scores()]}).text(options.json))
-    return 0
+    return Report({"tasks": [asdict(score) for score in bench.scores()]})
 
 
 def _task_queries(texts: Sequence[str], regions: Mapping[str, Region]) -> list[TaskQuery]:

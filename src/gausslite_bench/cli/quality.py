@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,16 +17,15 @@ from gausslite_bench.cli.study_options import (
     DEFAULT_HOME_FRAMES,
     DEFAULT_SIZE,
     StudyOptions,
-    add_study_options,
     real_sequence_plans,
+    study_command,
     write_results,
 )
-from gausslite_bench.quality.equal_time import RATE_FILE, with_measured_rate
 from gausslite_bench.quality.growth import curves, growth_plot, growth_table
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import choose_home_tasks
 from gausslite_bench.quality.scenes import UnseenRegionError
-from gausslite_bench.quality.study import FinishedTrial, Study, run_study
+from gausslite_bench.quality.study import FinishedTrial, Study, run_study, with_measured_rate
 from gausslite_bench.quality.tables import StudyResults, ablation_table, quality_table
 from gausslite_bench.quality.trial_cache import TrialCache
 from gausslite_bench.quality.trials import BudgetMode, Conditions, ScenePlan, TrialBudget, Variant, cumulative_variants
@@ -44,8 +43,7 @@ class _BudgetOptions:
     views: int = option(24, "held-out views per home", low=2)
     rate_hz: float | None = option(
         None,
-        "frame rate at equal time (default: that of uniform mapping with --iterations, measured on the first scene and "
-        f"stored in DIR/{RATE_FILE})",
+        "frame rate at equal time (default: that of uniform mapping with --iterations, measured on the first scene)",
         key="rate",
         metavar="HZ",
         low=MIN_RATE_HZ,
@@ -90,40 +88,18 @@ class _GrowthOptions:
     views: int = option(24, "held-out views per home", low=2)
 
 
-def configure_quality(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench quality`."""
-    add_study_options(parser, _QualityOptions, _BudgetOptions)
-    parser.set_defaults(run=run_quality)
-
-
-def configure_ablation(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench ablation`."""
-    add_study_options(parser, _AblationOptions, _BudgetOptions)
-    parser.set_defaults(run=run_ablation)
-
-
 def run_quality(options: argparse.Namespace) -> int:
     """Compare policies and write quality.md and quality.json."""
     variants = [Variant(name, name) for name in options.policies]
     if not variants:
         raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
-    results = _run(options, _study(options, options.pairs, (), variants))
-    _write(options.out, "quality", quality_table(results), results)
-    return 0
+    return _report(options, _study(options, options.pairs, (), variants), "quality", quality_table)
 
 
 def run_ablation(options: argparse.Namespace) -> int:
     """Enable the components one by one and write ablation.md and ablation.json."""
     study = _study(options, options.pair, (_ABLATION_TASK,), cumulative_variants())
-    results = _run(options, study)
-    _write(options.out, "ablation", ablation_table(results), results)
-    return 0
-
-
-def configure_compute(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench compute`."""
-    add_study_options(parser, _GrowthOptions)
-    parser.set_defaults(run=run_compute, equal=str(BudgetMode.ITERATIONS), rate=None, lpips_weights=None)
+    return _report(options, study, "ablation", ablation_table)
 
 
 def run_compute(options: argparse.Namespace) -> int:
@@ -154,7 +130,8 @@ def _with_step(options: argparse.Namespace, quantity: str, step: str) -> argpars
         raise InvalidInputError(f"steps: expected numbers such as {_GROWTH_STEPS[quantity][0]}, got {step!r}") from None
     name = quantity.replace("-", "_")
     equal = BudgetMode.TIME if quantity == "rate" else BudgetMode.ITERATIONS
-    return argparse.Namespace(**{**vars(options), name: value, "equal": str(equal)})
+    others = {"rate": None, "lpips_weights": None, "equal": str(equal)}
+    return argparse.Namespace(**{**vars(options), **others, name: value})
 
 
 def _study(
@@ -189,7 +166,7 @@ def _run(options: argparse.Namespace, study: Study) -> StudyResults:
     """Return the results of the study; finished trials are cached in the folder. Raises GaussLiteError."""
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights, options.threads)
     cache = TrialCache(options.out)
-    study = with_measured_rate(study, options.out)
+    study = with_measured_rate(study, cache)
     finished: list[FinishedTrial] = []
     unseen: list[UnseenRegionError] = []
     with progress_bar(sum(len(study.trials(plan)) for plan in study.plans), "trials", "trial") as bar:
@@ -214,6 +191,14 @@ def _line(finished: FinishedTrial) -> str:
     return f"{name}: {roi}, full {scores.full_psnr:.2f} dB{origin}"
 
 
-def _write(folder: Path, name: str, table: str, results: StudyResults) -> None:
-    write_results(folder, name, table, results.trials_as_json())
-    print(f"{table}→ {folder / f'{name}.md'}")
+def _report(options: argparse.Namespace, study: Study, name: str, table_of: Callable[[StudyResults], str]) -> int:
+    results = _run(options, study)
+    table = table_of(results)
+    write_results(options.out, name, table, results.trials_as_json())
+    print(f"{table}→ {options.out / f'{name}.md'}")
+    return 0
+
+
+configure_quality = study_command(run_quality, _QualityOptions, _BudgetOptions)
+configure_ablation = study_command(run_ablation, _AblationOptions, _BudgetOptions)
+configure_compute = study_command(run_compute, _GrowthOptions)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
@@ -30,6 +30,18 @@ def read_image_size(text: str) -> tuple[int, int]:
     if len(sides) != 2 or not all(16 <= side <= 4096 for side in sides):
         raise InvalidInputError(f"expected WIDTHxHEIGHT with sides of 16 to 4096, got {text!r}")
     return sides[0], sides[1]
+
+
+def names_among(names: Collection[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
+    """Return what reads an option of several names: it raises InvalidInputError unless they are among these."""
+
+    def read(given: tuple[str, ...]) -> tuple[str, ...]:
+        wrong = next((repr(name) for name in given if name not in names), None if given else "none")
+        if wrong is not None:
+            raise InvalidInputError(f"expected some of {', '.join(names)}, got {wrong}")
+        return given
+
+    return read
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +78,21 @@ class RealOptions:
     kinds: tuple[str, ...] = option((), "kinds of objects such as mug,chair (default: all)", metavar="A,B")
 
 
-def add_study_options(parser: argparse.ArgumentParser, *more: type) -> None:
-    """Add the options of a study and of real sequences."""
-    for settings_class in (StudyOptions, *more):
-        add_flags(parser, settings_class)
-    group = parser.add_argument_group("real sequence")
-    add_flags(group, RealOptions)
-    add_flags(group, SourceSettings, "up")
-    add_flags(group, RecordingOptions, "register-depth", "camera-correction")
+def study_command(
+    run: Callable[[argparse.Namespace], int], *settings: type
+) -> Callable[[argparse.ArgumentParser], None]:
+    """Return what adds a study's command to a parser: its own options, those of all studies and of real sequences."""
+
+    def configure(parser: argparse.ArgumentParser) -> None:
+        for settings_class in (StudyOptions, *settings):
+            add_flags(parser, settings_class)
+        group = parser.add_argument_group("real sequence")
+        add_flags(group, RealOptions)
+        add_flags(group, SourceSettings, "up")
+        add_flags(group, RecordingOptions, "register-depth", "camera-correction")
+        parser.set_defaults(run=run)
+
+    return configure
 
 
 def real_sequence_plans(

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.config.option import build, option
-from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import prepare_folder
 from gausslite.mission.settings import MissionSettings
@@ -15,8 +14,9 @@ from gausslite_bench.cli.study_options import (
     DEFAULT_HOME_FRAMES,
     DEFAULT_SIZE,
     StudyOptions,
-    add_study_options,
+    names_among,
     real_sequence_plans,
+    study_command,
     write_results,
 )
 from gausslite_bench.team.bench import TeamResult, TeamTrial, run_trial
@@ -31,30 +31,20 @@ class TeamOptions:
     homes: tuple[int, ...] = option((), "homes, 1 to 8 (default: 1, or none with --real)", metavar="N,...")
     team_sizes: tuple[int, ...] = option((2,), "numbers of agents, 2 to 4", metavar="N,...")
     policies: tuple[str, ...] = option(
-        ("task", "uniform", "splatam", "monogs", "gaussian-slam"), "policies", metavar="A,B"
+        ("task", "uniform", "splatam", "monogs", "gaussian-slam"),
+        "policies",
+        metavar="A,B",
+        convert=names_among(POLICIES),
     )
     seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...")
     views: int = option(16, "held-out views", low=1, high=10_000)
     refine_iterations: int = option(300, "joint refinement; 0: none", low=0)
 
-    def __post_init__(self) -> None:
-        unknown = set(self.policies) - set(POLICIES)
-        if unknown or not self.policies:
-            names = ", ".join(sorted(unknown)) or "none"
-            raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got {names}")
-
-
-def configure_team(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench team`."""
-    add_study_options(parser, TeamOptions)
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
-    parser.set_defaults(run=run_team)
-
 
 def run_team(options: argparse.Namespace) -> int:
     """Run the trials; the files are rewritten after each, so that an interrupt loses one trial at most."""
     plans, size = _plans(options)
-    trials = [(plan, _trials(options, plan, size)) for plan in plans]
+    trials = [(plan, _trials(options, plan)) for plan in plans]
     prepare_folder(options.out)
     results: list[TeamResult] = []
     with progress_bar(sum(len(plan_trials) for _, plan_trials in trials), "team", "trial") as bar:
@@ -89,7 +79,7 @@ def _plans(options: argparse.Namespace) -> tuple[list[TeamPlan], tuple[int, int]
     return plans, chosen.size or size
 
 
-def _trials(options: argparse.Namespace, plan: TeamPlan, size: tuple[int, int]) -> list[TeamTrial]:
+def _trials(options: argparse.Namespace, plan: TeamPlan) -> list[TeamTrial]:
     """Return the trials of one scene; invalid names and numbers fail here. Raises InvalidInputError."""
     chosen, team = build(StudyOptions, options), build(TeamOptions, options)
     return [
@@ -103,9 +93,14 @@ def _trials(options: argparse.Namespace, plan: TeamPlan, size: tuple[int, int]) 
                 threads=chosen.threads,
                 pose_prior=plan.pose_prior,
             ),
-            size=size,
             refine_iterations=team.refine_iterations,
         )
         for name in team.policies
         for seed in team.seeds
     ]
+
+
+def configure_team(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `bench team`."""
+    study_command(run_team, TeamOptions)(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")

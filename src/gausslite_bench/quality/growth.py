@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import pairwise
+from itertools import pairwise, product
 from statistics import fmean
 
-from gausslite_bench.quality.tables import FULL_FITTED, FULL_PSNR, ROI_FITTED, ROI_PSNR, StudyResults, markdown
+from gausslite_bench.quality.tables import FULL_PSNR, ROI_PSNR, StudyResults, markdown
 
 _TOLERATED_FALL_DB = 0.1
-_METRICS = ((ROI_PSNR, ROI_FITTED), (FULL_PSNR, FULL_FITTED))
-"""Each as rendered and fitted; where a scene has fitted views, its poses have errors and the fitted ones count."""
 _WIDTH, _HEIGHT, _MARGIN = 480.0, 200.0, 40.0
 _COLOURS = ("#2a78b8", "#d9822b", "#3a9d5d", "#b8475a")
 
@@ -41,13 +39,10 @@ def curves(steps: Mapping[str, StudyResults]) -> list[Curve]:
     """Return the curve of each scene, metric and policy. steps: the results by the value of the quantity, ascending."""
     first = next(iter(steps.values()))
     found = []
-    for scene in first.scenes:
-        for raw, fitted in _METRICS:
-            for policy in first.variants:
-                metric = fitted if first.values(scene, policy, fitted, first.budgets[0]) else raw
-                values = [step.values(scene, policy, metric, step.budgets[0]) for step in steps.values()]
-                if all(values):
-                    found.append(Curve(scene, policy, metric.title, [fmean(one) for one in values]))
+    for scene, metric, policy in product(first.scenes, (ROI_PSNR, FULL_PSNR), first.variants):
+        values = [step.values(scene, policy, metric, step.budgets[0]) for step in steps.values()]
+        if all(values):
+            found.append(Curve(scene, policy, metric.title, [fmean(own) for own in values]))
     return found
 
 
@@ -55,16 +50,9 @@ def growth_table(quantity: str, steps: Sequence[str], found: Sequence[Curve]) ->
     """Return one row for each curve, its largest fall, and how many fall."""
     rows = [["scene", "policy", f"PSNR by {quantity}", *steps, "largest fall"]]
     for curve in found:
-        fall = max(0.0, curve.largest_fall_db)
-        rows.append(
-            [
-                curve.scene,
-                curve.policy,
-                curve.metric,
-                *(f"{value:.2f}" for value in curve.psnr_db),
-                f"**{fall:.2f}**" if curve.falls else f"{fall:.2f}",
-            ]
-        )
+        fall = f"{max(0.0, curve.largest_fall_db):.2f}"
+        values = (f"{value:.2f}" for value in curve.psnr_db)
+        rows.append([curve.scene, curve.policy, curve.metric, *values, f"**{fall}**" if curve.falls else fall])
     falling = sum(curve.falls for curve in found)
     return (
         f"{markdown(rows)}\n\n{falling} of {len(found)} curves fall by more than {_TOLERATED_FALL_DB:g} dB in a step.\n"

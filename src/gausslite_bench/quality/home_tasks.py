@@ -1,28 +1,22 @@
-"""The 24 tasks in simulated homes with the objects in their regions."""
+"""The 24 tasks in simulated homes with the objects in their regions, of home_tasks.toml."""
 
 from __future__ import annotations
 
+import functools
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from pathlib import Path
 
 from gausslite.domain.errors import InvalidInputError
 
 
-class TaskKind(StrEnum):
-    """Kind of task (Sec. IV-A)."""
-
-    MANIPULATION = "manipulation"
-    SEARCH = "search"
-    NAVIGATION = "navigation"
-
-
 @dataclass(frozen=True, slots=True)
 class HomeTask:
-    """A task in a home. objects: names of the ground-truth objects in its region."""
+    """A task in a home. kind: manipulation, search or navigation. objects: the ground-truth objects in its region."""
 
     home: int
-    kind: TaskKind
+    kind: str
     task: str
     objects: tuple[str, ...]
 
@@ -32,36 +26,15 @@ class HomeTask:
         return f"home-{self.home}-{self.kind}"
 
 
-_OFFICE_DESK = ("laptop", "mug_1", "keyboard_1", "mouse_1", "monitor_1", "papers_1", "pen_cup", "plant_1")
-_MEETING_CHAIRS = tuple(f"chair_{i}" for i in range(1, 9))
-_TINS = tuple(f"paint_can_{i}" for i in range(1, 6))
-
-HOME_TASKS = (
-    HomeTask(1, TaskKind.MANIPULATION, "Prepare to pick up the mug on the coffee table", ("mug_1",)),
-    HomeTask(1, TaskKind.SEARCH, "Look for the armchair", ("armchair",)),
-    HomeTask(1, TaskKind.NAVIGATION, "Navigate to the sofa", ("sofa",)),
-    HomeTask(2, TaskKind.MANIPULATION, "Pick up the mug on the nightstand", ("mug",)),
-    HomeTask(2, TaskKind.SEARCH, "Find the shoes next to the bed", ("shoe_1",)),
-    HomeTask(2, TaskKind.NAVIGATION, "Go to the dresser", ("dresser",)),
-    HomeTask(3, TaskKind.MANIPULATION, "Prepare to pick up the bottles on the counter", ("bottle_1", "bottle_2")),
-    HomeTask(3, TaskKind.SEARCH, "Find the bowl on the table", ("bowl",)),
-    HomeTask(3, TaskKind.NAVIGATION, "Avoid the chairs", ("chair_1", "chair_2", "chair_3", "chair_4")),
-    HomeTask(4, TaskKind.MANIPULATION, "Grab the headphones on the desk", ("headphones",)),
-    HomeTask(4, TaskKind.SEARCH, "Look for the plant on the shelf", ("plant_1",)),
-    HomeTask(4, TaskKind.NAVIGATION, "Navigate to the desk", ("desk",)),
-    HomeTask(5, TaskKind.MANIPULATION, "Prepare to pick up the object on the desk", _OFFICE_DESK),
-    HomeTask(5, TaskKind.SEARCH, "Locate the printer", ("printer",)),
-    HomeTask(5, TaskKind.NAVIGATION, "Avoid the office chairs", ("chair_1", "chair_2", "chair_3", "chair_4")),
-    HomeTask(6, TaskKind.MANIPULATION, "Pick up the laptop and the mug on the table", ("laptop", "mug_1", "mug_2")),
-    HomeTask(6, TaskKind.SEARCH, "Search for the screen", ("screen",)),
-    HomeTask(6, TaskKind.NAVIGATION, "Locate all chairs and find a path to the door", (*_MEETING_CHAIRS, "door")),
-    HomeTask(7, TaskKind.MANIPULATION, "Fetch the teapot from the table", ("teapot",)),
-    HomeTask(7, TaskKind.SEARCH, "Look for the plants", ("plant_1", "plant_2", "plant_3")),
-    HomeTask(7, TaskKind.NAVIGATION, "Drive to the sofas", ("sofa_1", "sofa_2")),
-    HomeTask(8, TaskKind.MANIPULATION, "Prepare to pick up the drill on the workbench", ("drill",)),
-    HomeTask(8, TaskKind.SEARCH, "Find the paint cans on the rack", _TINS),
-    HomeTask(8, TaskKind.NAVIGATION, "Navigate to the ladder", ("ladder",)),
-)
+@functools.cache
+def home_tasks() -> tuple[HomeTask, ...]:
+    """Return the tasks, home by home."""
+    homes = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    return tuple(
+        HomeTask(int(home.removeprefix("home-")), kind, task, tuple(objects))
+        for home, kinds in homes.items()
+        for kind, (task, *objects) in kinds.items()
+    )
 
 
 def choose_home_tasks(names: Sequence[str]) -> tuple[HomeTask, ...]:
@@ -69,9 +42,12 @@ def choose_home_tasks(names: Sequence[str]) -> tuple[HomeTask, ...]:
 
     Raises InvalidInputError.
     """
-    chosen = tuple(task for task in HOME_TASKS if not names or any(f"{task.name}-".startswith(f"{n}-") for n in names))
+    chosen = tuple(
+        task for task in home_tasks() if not names or any(f"{task.name}-".startswith(f"{name}-") for name in names)
+    )
     unknown = [name for name in names if not any(f"{task.name}-".startswith(f"{name}-") for task in chosen)]
     if unknown:
-        expected = f"names such as home-3 or home-3-search (1 to 8; {', '.join(TaskKind)})"
+        kinds = ", ".join(dict.fromkeys(task.kind for task in home_tasks()))
+        expected = f"names such as home-3 or home-3-search (1 to 8; {kinds})"
         raise InvalidInputError(f"pairs: expected {expected}, got {', '.join(unknown)}")
     return chosen

@@ -6,9 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gausslite.domain.gaussians import Gaussians
+from gausslite.mapping.policies import UNIFORM
 from gausslite_bench.quality.scenes import Scene, UnseenRegionError
 from gausslite_bench.quality.trial_cache import TrialCache
 from gausslite_bench.quality.trials import (
+    BudgetMode,
     Conditions,
     MapCost,
     ScenePlan,
@@ -40,11 +42,6 @@ class Study:
             for seed in self.seeds
             for variant in self.variants
         ]
-
-    def with_rate(self, rate_hz: float) -> Study:
-        """Return the study with this rate in every budget that needs one."""
-        budgets = [replace(budget, rate_hz=rate_hz) if budget.needs_rate else budget for budget in self.budgets]
-        return replace(self, budgets=budgets)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,3 +80,21 @@ def run_study(study: Study, cache: TrialCache, lpips: Lpips | None) -> Iterator[
                 result = evaluate_map(built, trial, scene, lpips)
                 cache.store(trial, result)
             yield FinishedTrial(trial, result, is_cached)
+
+
+def with_measured_rate(study: Study, cache: TrialCache) -> Study:
+    """Return the study with a rate in every budget that needs one. Raises GaussLiteError.
+
+    Results at a fixed rate depend on the machine's speed. The rate is therefore that of uniform mapping with the
+    budget's iterations, measured by a trial on the first scene, which the cache keeps.
+    """
+    timed = next((budget for budget in study.budgets if budget.needs_rate), None)
+    if timed is None:
+        return study
+    counted, uniform = replace(timed, equal=BudgetMode.ITERATIONS), Variant(UNIFORM, UNIFORM)
+    for outcome in run_study(replace(study, variants=[uniform], budgets=[counted]), cache, None):
+        if isinstance(outcome, FinishedTrial):
+            rate_hz = float(f"{1e3 / outcome.result.cost.ms_per_frame:.3g}")
+            with_rate = [replace(own, rate_hz=rate_hz) if own.needs_rate else own for own in study.budgets]
+            return replace(study, budgets=with_rate)
+    raise UnseenRegionError("expected a scene whose region is in a held-out view, got none")

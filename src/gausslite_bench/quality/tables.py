@@ -13,31 +13,27 @@ from gausslite_evaluation.lpips import NAME as LPIPS_NAME
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A field of MapScores, of the views as rendered or fitted; factor converts it to the table's unit."""
+    """A field of MapScores; factor converts it to the table's unit."""
 
     title: str
     field: str
     digits: int
     factor: float = 1.0
-    fitted: bool = False
 
     def value(self, result: TrialResult) -> float | None:
         """Return the value in the table's unit; None if the trial does not have it."""
-        scores = result.fitted if self.fitted else result.scores
-        value = None if scores is None else getattr(scores, self.field)
+        value = getattr(result.scores, self.field)
         return None if value is None else self.factor * value
 
 
-_KINDS = (("PSNR↑", "psnr", 2, 1.0), ("SSIM↑", "ssim", 3, 1.0), (f"{LPIPS_NAME}↓", "lpips", 3, 1.0))
+_KINDS = (("PSNR↑", "psnr", 2), ("SSIM↑", "ssim", 3), (f"{LPIPS_NAME}↓", "lpips", 3))
 _METRICS = [
-    *(Metric(f"ROI {title}", f"roi_{name}", digits, factor) for title, name, digits, factor in _KINDS),
+    *(Metric(f"ROI {title}", f"roi_{name}", digits) for title, name, digits in _KINDS),
     Metric("ROI depth L1 [cm]↓", "roi_depth_l1_m", 2, 100.0),
     Metric("ROI covered [%]↑", "roi_covered", 1, 100.0),
-    *(Metric(f"full {title}", f"full_{name}", digits, factor) for title, name, digits, factor in _KINDS),
+    *(Metric(f"full {title}", f"full_{name}", digits) for title, name, digits in _KINDS),
 ]
-_FITTED_METRICS = [Metric(f"{m.title}, fitted", m.field, m.digits, m.factor, fitted=True) for m in _METRICS]
 ROI_PSNR, FULL_PSNR = _METRICS[0], _METRICS[5]
-ROI_FITTED, FULL_FITTED = _FITTED_METRICS[0], _FITTED_METRICS[5]
 
 
 class StudyResults:
@@ -53,11 +49,6 @@ class StudyResults:
         self.scenes, self.variants, self.budgets = (
             list(dict.fromkeys(part)) for part in zip(*self._results, strict=True)
         )
-
-    @property
-    def has_fitted(self) -> bool:
-        """True if a trial has scores with fitted views."""
-        return any(one.result.fitted is not None for one in self._finished)
 
     def values(self, scene: str, variant: str, metric: Metric, budget: TrialBudget) -> list[float]:
         """Return the metric of each seed that has it."""
@@ -104,19 +95,16 @@ def quality_table(results: StudyResults) -> str:
     for budget in results.budgets:
         blocks += [
             f"## Equal {budget.equal} ({budget}), at most {budget.max_gaussians} Gaussians",
-            _means(results, _METRICS, budget),
-            *([_means(results, _FITTED_METRICS, budget)] if results.has_fitted else ()),
-            "ROI PSNR in dB of each scene, and the margins over the best other policy:",
-            _by_scene(results, ROI_PSNR, FULL_PSNR, budget),
-            *([_by_scene(results, ROI_FITTED, FULL_FITTED, budget)] if results.has_fitted else ()),
+            _means(results, budget),
+            "ROI PSNR in dB, of fitted views where poses may be wrong, and margins over the best other policy:",
+            _by_scene(results, budget),
         ]
     return "\n\n".join(blocks) + "\n"
 
 
 def ablation_table(results: StudyResults) -> str:
     """Return one row per component: ROI and full PSNR at every budget, per scene and on average."""
-    metrics = [ROI_PSNR, FULL_PSNR, *((ROI_FITTED, FULL_FITTED) if results.has_fitted else ())]
-    columns = [(metric, budget) for budget in results.budgets for metric in metrics]
+    columns = [(metric, budget) for budget in results.budgets for metric in (ROI_PSNR, FULL_PSNR)]
     blocks = []
     for name, scenes in {**{scene: [scene] for scene in results.scenes}, "Mean": results.scenes}.items():
         task = f": {results.tasks[name]} (ROI {results.shown(name)})" if name in results.tasks else ""
@@ -129,32 +117,32 @@ def ablation_table(results: StudyResults) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def _means(results: StudyResults, metrics: Sequence[Metric], budget: TrialBudget) -> str:
+def _means(results: StudyResults, budget: TrialBudget) -> str:
     costs = ("iterations a frame", "ms a frame", "Gaussians", "kB in messages")
-    rows = [["policy", *(metric.title for metric in metrics), *costs]]
+    rows = [["policy", *(metric.title for metric in _METRICS), *costs]]
     for variant in results.variants:
-        means = (results.mean(results.scenes, variant, metric, budget) for metric in metrics)
-        cells = [_number(mean, metric) for mean, metric in zip(means, metrics, strict=True)]
+        means = (results.mean(results.scenes, variant, metric, budget) for metric in _METRICS)
+        cells = [_number(mean, metric) for mean, metric in zip(means, _METRICS, strict=True)]
         rows.append([variant, *cells, *results.costs(variant, budget)])
     return markdown(rows)
 
 
-def _by_scene(results: StudyResults, roi: Metric, full: Metric, budget: TrialBudget) -> str:
-    rows = [["scene", "task", "ROI", *results.variants, f"margin, {roi.title}", f"margin, {full.title}"]]
+def _by_scene(results: StudyResults, budget: TrialBudget) -> str:
+    rows = [["scene", "task", "ROI", *results.variants, f"margin, {ROI_PSNR.title}", f"margin, {FULL_PSNR.title}"]]
     for scene in results.scenes:
-        cells = [_with_spread(results.values(scene, variant, roi, budget), roi) for variant in results.variants]
-        margins = [results.margin(scene, metric, budget) for metric in (roi, full)]
+        cells = [_with_spread(results.values(scene, variant, ROI_PSNR, budget)) for variant in results.variants]
+        margins = [results.margin(scene, metric, budget) for metric in (ROI_PSNR, FULL_PSNR)]
         signed = ["" if margin is None else f"{margin:+.2f}" for margin in margins]
         rows.append([scene, results.tasks[scene], results.shown(scene), *cells, *signed])
-    known = [margin for scene in results.scenes if (margin := results.margin(scene, roi, budget)) is not None]
+    known = [margin for scene in results.scenes if (margin := results.margin(scene, ROI_PSNR, budget)) is not None]
     if not known:
         return markdown(rows)
     ahead = f"{sum(margin > 0 for margin in known)} of {len(known)}, by {fmean(known):+.2f} dB in the mean"
     return f"{markdown(rows)}\n\n`{results.variants[0]}` exceeds the best other policy in {ahead}."
 
 
-def _with_spread(values: Sequence[float], metric: Metric) -> str:
-    return f"{fmean(values):.{metric.digits}f} ± {pstdev(values):.{metric.digits}f}" if values else "–"
+def _with_spread(values: Sequence[float]) -> str:
+    return f"{fmean(values):.2f} ± {pstdev(values):.2f}" if values else "–"
 
 
 def _number(value: float | None, metric: Metric) -> str:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -155,19 +156,17 @@ class MapCost:
 class TrialResult:
     """Result of a trial. roi_share: region's share of the held-out views.
 
-    fitted: scores after fitting each view's pose and exposure, where poses may be wrong.
+    scores: where poses may be wrong, each view is fitted in pose and exposure first.
     """
 
     scores: MapScores
-    fitted: MapScores | None
     roi_share: float
     cost: MapCost
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> TrialResult:
         """Return the result of `asdict`'s values. Raises TypeError, KeyError for other content."""
-        fitted = None if stored["fitted"] is None else MapScores(**stored["fitted"])
-        return cls(MapScores(**stored["scores"]), fitted, stored["roi_share"], MapCost(**stored["cost"]))
+        return cls(MapScores(**stored["scores"]), stored["roi_share"], MapCost(**stored["cost"]))
 
 
 def message_bytes(gaussians: Gaussians, grid: VoxelGrid) -> int:
@@ -197,8 +196,6 @@ def evaluate_map(built: tuple[Gaussians, MapCost], trial: Trial, scene: Scene, l
     """Return the map's scores on the held-out views. Raises GaussLiteError."""
     gaussians, cost = built
     viewer = MapViewer(gaussians, choose_rasterizer(threads=trial.conditions.threads))
-    scores = average([score_view(viewer.render_frame(view.frame), view, lpips) for view in scene.held_out])
-    fitted = None
-    if trial.plan.pose_prior.has_pose_error:
-        fitted = average([score_view(render_fitted(viewer, view.frame), view, lpips) for view in scene.held_out])
-    return TrialResult(scores, fitted, scene.roi_share, cost)
+    render = partial(render_fitted, viewer) if trial.plan.pose_prior.has_pose_error else viewer.render_frame
+    scores = average([score_view(render(view.frame), view, lpips) for view in scene.held_out])
+    return TrialResult(scores, scene.roi_share, cost)

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gausslite.config.option import option
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.cpu import CpuRasterizer, usable_simd
 from gausslite.render.rasterizer import FULL_FRAME, TILE_PX, AdamSettings, LossWeights, Rasterizer, Subset
 from gausslite_bench.cli.study_options import read_image_size
-from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
+from gausslite_bench.raster.room import held_out_frame, seed_rows
 from gausslite_bench.report import Report
 
 _LOSSES = {
@@ -84,16 +86,14 @@ def run_gpu(settings: GpuSettings) -> Report:
 
 
 def _cases(rasterizer: Rasterizer, size: tuple[int, int], counts: Sequence[int], reps: int) -> list[dict[str, object]]:
-    view = held_out_view(*size)
+    view = held_out_frame(*size)
     return [
         {"gaussians": count, "size": list(size), "operations": operation_times(rasterizer, count, view, reps)}
         for count in counts
     ]
 
 
-def operation_times(
-    rasterizer: Rasterizer, count: int, view: BenchView, repetitions: int
-) -> dict[str, dict[str, float]]:
+def operation_times(rasterizer: Rasterizer, count: int, view: Frame, repetitions: int) -> dict[str, dict[str, float]]:
     """Return the minimum and the median of each operation in milliseconds; region: a step on a fifth of the image."""
     table = SplatTable(count)
     table.append_rows(
@@ -111,7 +111,7 @@ def operation_times(
     }
 
 
-def _operations(rasterizer: Rasterizer, table: SplatTable, view: BenchView) -> dict[str, Callable[[], object]]:
+def _operations(rasterizer: Rasterizer, table: SplatTable, view: Frame) -> dict[str, Callable[[], object]]:
     height, width = view.depth_m.shape
     tiles = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.bool_)
     top, left = (round((1.0 - _REGION_SHARE**0.5) / 2.0 * count) for count in tiles.shape)
@@ -120,11 +120,11 @@ def _operations(rasterizer: Rasterizer, table: SplatTable, view: BenchView) -> d
     prepared = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, pixels)
     step = functools.partial(
         rasterizer.step,
-        *(table.rows, table.first_moment, table.second_moment, prepared, view.T_camera_world),
+        *(table.rows, table.first_moment, table.second_moment, prepared, inverse(view.T_world_camera)),
         adam=_STILL,
     )
     d_rgb, d_depth_m = (np.full(image.shape, 1e-5, np.float32) for image in (view.rgb, view.depth_m))
-    forward = functools.partial(rasterizer.forward, table.rows, view.camera, view.T_camera_world)
+    forward = functools.partial(rasterizer.forward, table.rows, view.camera, inverse(view.T_world_camera))
     return {
         **{name: functools.partial(step, loss=loss, subset=FULL_FRAME) for name, loss in _LOSSES.items()},
         "region": functools.partial(step, loss=_LOSSES["fused_l1_ssim"], masked=True, subset=Subset(tiles=tiles)),

@@ -11,7 +11,7 @@ import numpy as np
 
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.convert import frame_to_message
-from gausslite_bench.async_calls import UpdateStream, UpdateStreams
+from gausslite_bench.async_calls import UpdateStream, UpdateStreams, send_all
 from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, keyframe, object_report
 from gausslite_language.rules import RuleParser
 
@@ -59,7 +59,7 @@ class AgentLoad:
                 agent_id = f"load-{number}"
                 session_id = client.join(agent_id, GRID).session_id
                 messages = list(fill_messages(agent_id, 200_000 + number * voxels, voxels))
-                asyncio.run(self._send_all(session_id, messages))
+                send_all(self._address, session_id, messages)
                 self._next_seq = len(messages) + 1
 
     def run(self, agents: int, seconds: float) -> LoadResult:
@@ -74,13 +74,6 @@ class AgentLoad:
         p50, p99 = np.percentile(times_s or [np.inf], [50, 99]) * 1000
         total = agents * count
         return LoadResult(agents, total, float(p50), float(p99), total - len(times_s), refused)
-
-    async def _send_all(self, session_id: str, messages: Sequence[bytes]) -> None:
-        async with UpdateStreams(self._address) as streams:
-            stream = streams.open(session_id)
-            for data in messages:
-                await stream.send(data)
-            await stream.close()
 
     async def _send(self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]) -> tuple[list[float], int]:
         times_s: list[float] = []

@@ -18,6 +18,7 @@ from gausslite.cli.progress import progress_bar
 from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.wire.clients import FusionClient
+from gausslite_bench.cli.study_options import names_among
 from gausslite_bench.report import Report
 from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult
 from gausslite_bench.server.hostile import ATTACKS, measure_attack
@@ -46,15 +47,13 @@ class ServerBenchSettings:
         (),
         f"only measure good callers under these attacks, each on a new server: all, or some of {', '.join(ATTACKS)}",
         metavar="A,B",
+        convert=names_among(("all", *ATTACKS)),
     )
 
     def __post_init__(self) -> None:
         for name, counts, least in (("held", self.held, 0), ("agents", self.agents, 1)):
             if not counts or min(counts) < least:
                 raise InvalidInputError(f"--{name}: expected numbers of at least {least}, got {counts}")
-        unknown = set(self.hostile) - {*ATTACKS, "all"}
-        if unknown:
-            raise InvalidInputError(f"--hostile: expected all, or some of {', '.join(ATTACKS)}, got {min(unknown)!r}")
 
 
 def run_server(settings: ServerBenchSettings) -> Report:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ from gausslite.domain.voxels import RoiSubset
 from gausslite.wire.channel import ServiceChannel, require_serving
 from gausslite.wire.clients import AgentClient, FusionClient, ParserClient
 from gausslite.wire.convert import frame_to_message
-from gausslite_bench.async_calls import UpdateStreams
+from gausslite_bench.async_calls import UpdateStreams, send_all
 from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult, load_of_calls, load_of_frames
 from gausslite_bench.server.synthetic_updates import (
     GAUSSIANS_PER_VOXEL,
@@ -129,20 +129,12 @@ def _flood_of_views(address: str, callers: int, connect: Callable[[str, float], 
     _flood(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
 
 
-async def _send(address: str, session_id: str, messages: Iterable[bytes]) -> None:
-    async with UpdateStreams(address) as streams:
-        stream = streams.open(session_id)
-        for message in messages:
-            await stream.send(message)
-        await stream.close()
-
-
 def _hold_map(address: str) -> str:
     """Join and store _HELD_VOXELS; returns the session."""
     ((name, session_id),) = _join(address, 1)
     parts = np.array_split(np.arange(1_000_000, 1_000_000 + _HELD_VOXELS), 100)
     subsets = (RoiSubset(name, "", seq, seq, voxels_batch(part, seq, 1)) for seq, part in enumerate(parts, start=1))
-    asyncio.run(_send(address, session_id, (encode_subset(subset, GRID) for subset in subsets)))
+    send_all(address, session_id, (encode_subset(subset, GRID) for subset in subsets))
     return session_id
 
 
@@ -151,7 +143,7 @@ def _new_maps(address: str) -> None:
 
     def begin(client: FusionClient, _: int) -> None:
         session_id = client.join("bad-0", GRID, fresh_map=True).session_id
-        asyncio.run(_send(address, session_id, [_voxels("bad-0", 50)]))
+        send_all(address, session_id, [_voxels("bad-0", 50)])
 
     _flood(address, begin, _client, callers=1)
 

@@ -32,7 +32,6 @@ class TeamTrial:
 
     plan: TeamPlan
     settings: MissionSettings
-    size: tuple[int, int]
     refine_iterations: int
 
 
@@ -68,21 +67,22 @@ class TeamResult:
 def run_trial(trial: TeamTrial, scene: TeamScene) -> TeamResult:
     """Map, fuse and score. Raises GaussLiteError."""
     maps = [
-        map_agent(agent, replace(trial.settings, seed=trial.settings.seed + i), _GRID)
-        for i, agent in enumerate(scene.agents)
+        map_agent(name, agent, replace(trial.settings, seed=trial.settings.seed + i), _GRID)
+        for i, (name, agent) in enumerate(scene.items())
     ]
     fused, engine = _fuse(trial, maps)
     fused |= {f"{agent_map.agent_id} alone": agent_map.gaussians for agent_map in maps}
     rasterizer = choose_rasterizer(threads=trial.settings.threads)
     viewers = {name: MapViewer(gaussians, rasterizer) for name, gaussians in fused.items() if len(gaussians)}
+    views = next(iter(scene.values())).held_out
     total, active = (
         sum(values) for values in zip(*((len(m.gaussians), m.gaussians.active.sum()) for m in maps), strict=True)
     )
     return TeamResult(
-        scene=scene.name,
+        scene=trial.plan.name,
         policy=trial.settings.policy,
         seed=trial.settings.seed,
-        scores=score_team(viewers, scene.views, {}, trial.plan.pose_prior.has_pose_error, sheets=0).scores,
+        scores=score_team(viewers, views, {}, trial.plan.pose_prior.has_pose_error, sheets=0).scores,
         share_percent=100.0 * float(active) / max(total, 1),
         bytes_sent=sum(agent_map.bytes_sent for agent_map in maps),
         gaussians_sent=sum(len(message.batch.gaussians) for agent_map in maps for message in agent_map.messages),

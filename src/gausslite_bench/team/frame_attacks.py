@@ -14,7 +14,6 @@ from numpy import ndarray
 
 from gausslite.cli.progress import progress_bar
 from gausslite.config.option import option
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of, transform_points
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_keys
@@ -23,7 +22,8 @@ from gausslite.fusion.frames import AlignmentState
 from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.render.rasterizer import MEAN, RGB
-from gausslite_bench.raster.procedural_room import SEED_VIEWS, seed_rows
+from gausslite_bench.cli.study_options import names_among
+from gausslite_bench.raster.room import SEED_VIEWS, seed_rows
 from gausslite_bench.report import Report
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.surface_registration import Surface
@@ -150,11 +150,9 @@ class FrameAttackSettings:
     """The options of `bench frames`."""
 
     runs: int = option(20, "runs of each attack, with the seeds 0, 1 and so on", low=1)
-    attacks: tuple[str, ...] = option(tuple(ATTACKS), f"among {', '.join(ATTACKS)}", metavar="A,B")
-
-    def __post_init__(self) -> None:
-        if unknown := {*self.attacks} - {*ATTACKS}:
-            raise InvalidInputError(f"--attacks: expected some of {', '.join(ATTACKS)}, got {min(unknown)!r}")
+    attacks: tuple[str, ...] = option(
+        tuple(ATTACKS), f"among {', '.join(ATTACKS)}", metavar="A,B", convert=names_among(ATTACKS)
+    )
 
 
 def run_frame_attacks(settings: FrameAttackSettings) -> Report:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,14 +17,13 @@ from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.runner import MissionRunner
-from gausslite.mission.settings import MissionSettings, SceneInfo
+from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.quality.trials import message_bytes
-from gausslite_bench.team.scenes import AgentScene
 from gausslite_refinement.keyframe_selection import KeyframeSelection
 
 _ROUND_FRAMES = 4
@@ -70,12 +70,11 @@ class _SentMessages:
             self._spool.mark_done(due.voxels)
 
 
-def map_agent(agent: AgentScene, settings: MissionSettings, grid: VoxelGrid) -> AgentMap:
+def map_agent(agent_id: str, scene: Scene, settings: MissionSettings, grid: VoxelGrid) -> AgentMap:
     """Return the agent's map after all its frames. A policy without a task sends its whole map once, at the end."""
     follows_task = settings.mapper_settings().components.follow_task
-    scene = Scene(agent.task, agent.frames, agent.masks, (), SceneInfo())
     estimator = RecordedRelevanceEstimator(scene) if follows_task else NoTaskEstimator()
-    sent = _SentMessages(agent.agent_id, grid)
+    sent = _SentMessages(agent_id, grid)
     gaussian_mapper = build_mapper(settings)
     mapper = TaskMapper(
         estimator,
@@ -84,21 +83,18 @@ def map_agent(agent: AgentScene, settings: MissionSettings, grid: VoxelGrid) -> 
         FrameScheduler(settings.scheduler_settings),
         sent.publish,
     )
-    outcomes: list[FrameOutcome] = []
+    numbers = itertools.count(1)
 
-    def after_frame(outcome: FrameOutcome) -> None:
-        outcomes.append(outcome)
-        if len(outcomes) % _ROUND_FRAMES == 0:
+    def after_frame(_outcome: FrameOutcome) -> None:
+        if next(numbers) % _ROUND_FRAMES == 0:
             sent.send()
 
-    MissionRunner(mapper.process, after_frame).run(agent.frames).raise_if_stopped()
+    MissionRunner(mapper.process, after_frame).run(scene.training).raise_if_stopped()
     sent.send(0.0)
-    keyframes = tuple(
-        AgentKeyframe(agent.agent_id, keyframe) for keyframe in _select_keyframes(mapper.keyframes(), grid)
-    )
+    keyframes = tuple(AgentKeyframe(agent_id, frame) for frame in _select_keyframes(mapper.keyframes(), grid))
     gaussians = without_guesses(gaussian_mapper.gaussians(), (kept.frame for kept in gaussian_mapper.store.kept))
     return AgentMap(
-        agent_id=agent.agent_id,
+        agent_id=agent_id,
         gaussians=gaussians,
         keyframes=keyframes,
         messages=tuple(sent.messages),

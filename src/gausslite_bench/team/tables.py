@@ -2,47 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import fmean
 
+from gausslite_bench.quality.tables import markdown
 from gausslite_bench.team.bench import CONCATENATION, TeamResult
+
+_HEADER = ("scene", "policy", "strategy", "ROI PSNR", "gain", "ROI SSIM", "full PSNR", "share", "sent", "seeds")
+_LEGEND = (
+    "PSNR in dB on held-out views, in the union of the agents' regions (ROI) and over whole images. share: Gaussians "
+    "of the regions; sent: Gaussians and bytes of all messages of the regions, resends included, and the bytes as a "
+    "share of the whole maps' bytes."
+)
 
 
 def team_table(results: Sequence[TeamResult]) -> str:
     """Return the table; gain: ROI PSNR over the concatenation of the same policy; share and bytes: per team."""
-    lines = [
-        "PSNR in dB on held-out views, in the union of the agents' regions (ROI) and over whole images. share: "
-        "Gaussians of the regions; sent: Gaussians and bytes of all messages of the regions, resends included, and the "
-        "bytes as a share of the whole maps' bytes.",
-        "",
-        "| scene | policy | strategy | ROI PSNR | gain | ROI SSIM | full PSNR | share | sent | seeds |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
     groups: dict[tuple[str, str], list[TeamResult]] = {}
     for result in results:
         groups.setdefault((result.scene, result.policy), []).append(result)
-    for (scene, policy), group in groups.items():
-        lines += [
-            f"| {scene} | {policy} | {strategy} | {_scores(group, strategy)} | {_sent(group)} | {len(group)} |"
-            for strategy in group[0].scores
-        ]
-    return "\n".join(lines) + "\n"
+    rows = (row for group in groups.values() for row in _rows(group))
+    return f"{_LEGEND}\n\n{markdown([_HEADER, *rows])}\n"
 
 
-def _scores(group: Sequence[TeamResult], strategy: str) -> str:
-    scores = [result.scores[strategy] for result in group]
-    gain = _mean(group, strategy) - _mean(group, CONCATENATION)
-    ssim, full = fmean(score.roi_ssim or 0.0 for score in scores), fmean(score.full_psnr for score in scores)
-    return f"{_mean(group, strategy):.2f} | {gain:+.2f} | {ssim:.3f} | {full:.2f}"
-
-
-def _mean(group: Sequence[TeamResult], strategy: str) -> float:
-    return fmean(result.scores[strategy].roi_psnr or 0.0 for result in group)
-
-
-def _sent(group: Sequence[TeamResult]) -> str:
-    share = fmean(result.share_percent for result in group)
-    gaussians = fmean(result.gaussians_sent for result in group)
-    megabytes = fmean(result.bytes_sent / 1e6 for result in group)
-    percent = fmean(100 * result.bytes_sent / max(result.bytes_whole, 1) for result in group)
-    return f"{share:.1f} % | {gaussians:.0f}, {megabytes:.2f} MB ({percent:.1f} %)"
+def _rows(group: Sequence[TeamResult]) -> Iterator[list[str]]:
+    """Yield a row for each strategy, from the results of all seeds of one scene and policy."""
+    gaussians, sent, whole = (
+        fmean(getattr(result, name) for result in group) for name in ("gaussians_sent", "bytes_sent", "bytes_whole")
+    )
+    figures = f"{fmean(result.share_percent for result in group):.1f} %"
+    messages = f"{gaussians:.0f}, {sent / 1e6:.2f} MB ({100 * sent / max(whole, 1):.1f} %)"
+    psnr = {name: fmean(result.scores[name].roi_psnr or 0.0 for result in group) for name in group[0].scores}
+    for name, roi_psnr in psnr.items():
+        scores = [result.scores[name] for result in group]
+        ssim, full = fmean(score.roi_ssim or 0.0 for score in scores), fmean(score.full_psnr for score in scores)
+        quality = f"{roi_psnr:.2f}", f"{roi_psnr - psnr[CONCATENATION]:+.2f}", f"{ssim:.3f}", f"{full:.2f}"
+        yield [group[0].scene, group[0].policy, name, *quality, figures, messages, str(len(group))]
