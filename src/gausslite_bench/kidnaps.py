@@ -125,30 +125,41 @@ class _Recording:
     elsewhere: Source
     settings: KidnapSettings
 
+    def require_frames(self) -> None:
+        """Raise InvalidInputError if a recording is too short for the events."""
+        settings = self.settings
+        places = [self._place(EVENTS[name].follow) for name in settings.events]
+        for source, first in [(self.source, settings.frames - settings.after), *places]:
+            count = (first + settings.after) * settings.stride
+            if count > len(source):
+                raise InvalidInputError(
+                    f"{source.name}: expected at least {count} frames, got {len(source)}; "
+                    "use fewer --frames, --after or a smaller --stride"
+                )
+
     def before(self) -> Frames:
         """Return the frames before each event."""
         return self._frames(self.source, 0, self.settings.frames, 0)
 
     def after(self, follow: str) -> Frames:
         """Return the frames that follow."""
-        count = self.settings.frames
+        frames = self._frames(*self._place(follow), self.settings.after, self.settings.frames)
         if follow == "way":
-            return self._frames(self.source, count, self.settings.after, count)
-        source, first = (self.source, count // 4) if follow == "seen" else (self.elsewhere, 0)
+            return frames
         rng = np.random.default_rng(0)
         return [
             replace(frame, rgb=np.clip(frame.rgb + rng.normal(0, _NOISE, frame.rgb.shape), 0, 255).astype(np.uint8))
-            for frame in self._frames(source, first, self.settings.after, count)
+            for frame in frames
         ]
 
+    def _place(self, follow: str) -> tuple[Source, int]:
+        """Return where the frames that follow are: the recording, and the first of them."""
+        if follow == "elsewhere":
+            return self.elsewhere, 0
+        return self.source, self.settings.frames // (1 if follow == "way" else 4)
+
     def _frames(self, source: Source, first: int, count: int, index: int) -> Frames:
-        stride = self.settings.stride
-        if (first + count) * stride > len(source):
-            raise InvalidInputError(
-                f"{source.name}: expected at least {(first + count) * stride} frames, got {len(source)}; "
-                "use fewer --frames, --after or a smaller --stride"
-            )
-        camera = source.camera.narrower(self.settings.width)
+        stride, camera = self.settings.stride, source.camera.narrower(self.settings.width)
         size = camera.width_px, camera.height_px
         step_ns = round(1e9 * stride * float(np.median(np.diff(self.source.trajectory().times_s))))
         return [
@@ -257,7 +268,9 @@ def run_kidnaps(settings: KidnapSettings) -> Report:
     noticed, found: number of the first frame after the event that is not mapped as before, and that is mapped right.
     wrong: frames that are mapped at a wrong pose, wrong_gs: Gaussians that these add. psnr: of the frames before it.
     """
-    trials = _Trials(_Recording(open_source(settings.source), open_source(settings.elsewhere), settings))
+    recording = _Recording(open_source(settings.source), open_source(settings.elsewhere), settings)
+    recording.require_frames()
+    trials = _Trials(recording)
     rows = []
     with progress_bar(2 * len(settings.events), "kidnaps", "mission") as progress:
         for name in settings.events:
