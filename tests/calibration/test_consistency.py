@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -27,6 +28,12 @@ SIZE = (160, 120)
 NOTHING_ESTIMATED = StatedValues(correction=CameraCorrection(), pose_prior=PoseExposurePrior())
 
 
+@cache
+def frame_of(home: Source, position: int) -> Frame:
+    """Return a frame that is rendered once for all tests."""
+    return home.frame(position, SIZE)
+
+
 class Recording(WrappedSource):
     """Frames of a simulated home that state neither exact poses nor an ideal camera; 30 frames a second."""
 
@@ -35,7 +42,7 @@ class Recording(WrappedSource):
 
     def __init__(self, home: Source, positions: list[int]) -> None:
         super().__init__(home)
-        self.frames = [home.frame(position, SIZE) for position in positions]
+        self.frames = [frame_of(home, position) for position in positions]
         self.poses = np.array([frame.T_world_camera for frame in self.frames])
         self.depth_factor = 1.0
 

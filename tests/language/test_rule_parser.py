@@ -174,6 +174,7 @@ def test_every_known_noun_is_parsed_as_a_noun(at):
         assert not adjective or any(each.colour == "red" for each in graph.attributes)
 
 
+@pytest.mark.slow
 def test_a_sentence_takes_less_than_10_ms():
     parser = RuleParser()
     parser.parse("warm up the table")

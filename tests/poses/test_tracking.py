@@ -27,7 +27,7 @@ from gausslite_poses.photometric import align
 from gausslite_poses.tracking import CameraTracker, KeyframeIndex
 
 PRIOR_STD = np.array([0.1] * 3 + [0.1] * 3)
-SETTINGS = MissionSettings(policy="uniform", max_gaussians=20_000, threads=1, poses=PoseMode.TRACK)
+SETTINGS = MissionSettings(policy="uniform", max_gaussians=20_000, iterations=4, threads=1, poses=PoseMode.TRACK)
 
 
 @cache

@@ -40,7 +40,7 @@ PROGRAM = """
 import dataclasses, json, sys
 import gausslite as gl
 from gausslite.domain.errors import InvalidInputError
-home = gl.open_sequence("sim:home")
+home = gl.open_sequence("sim:home?size=32x24")
 frame = home.frame(0, (32, 24))
 messages = {}
 for call in json.load(sys.stdin):

@@ -19,7 +19,7 @@ def without_evaluators_and_pages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def arguments(out: Path) -> list[str]:
-    return ["map", "sim:home", "--frames", "0:2", "--size", "80x60", "--iterations", "2", "--out", str(out)]
+    return ["map", "sim:home?frames=2&size=80x60", "--iterations", "2", "--out", str(out)]
 
 
 def test_the_map_is_written_and_one_line_says_what_is_left_out(

@@ -168,25 +168,19 @@ def test_damage_is_named(
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("name", "make", "message"),
     [
-        (lambda path: None, "got nothing there"),
-        (lambda path: path.write_text("x"), "got a file"),
-        (lambda path: path.write_text(""), "got an empty file"),
-        (lambda path: path.mkdir(), "got an empty folder"),
-        (lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
+        ("place", lambda path: None, "got nothing there"),
+        ("place", lambda path: path.write_text("x"), "got a file"),
+        ("place", lambda path: path.write_text(""), "got an empty file"),
+        ("place", lambda path: path.mkdir(), "got an empty folder"),
+        ("place", lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
+        ("desk.tar.gz", lambda path: path.write_bytes(gzip.compress(b"")), "got a gzip archive; unpack it first"),
     ],
 )
-def test_a_place_without_a_sequence_is_named(tmp_path: Path, make: Damage, message: str) -> None:
-    make(tmp_path / "place")
-    with pytest.raises(DatasetError, match=f"place: .*{message}"):
-        open_source(str(tmp_path / "place"))
-
-
-def test_a_compressed_recording_is_named(tmp_path: Path) -> None:
-    (tmp_path / "desk.tar.gz").write_bytes(gzip.compress(b""))
-    with pytest.raises(DatasetError, match=r"desk.tar.gz: .* got a gzip archive; unpack it first"):
-        open_source(str(tmp_path / "desk.tar.gz"))
+def test_a_place_without_a_sequence_is_named(tmp_path: Path, name: str, make: Damage, message: str) -> None:
+    make(tmp_path / name)
+    pytest.raises(DatasetError, open_source, str(tmp_path / name)).match(f"{name}: .*{message}")
 
 
 def test_a_depth_image_without_returns_is_no_error(tmp_path: Path) -> None:

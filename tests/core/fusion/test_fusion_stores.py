@@ -304,24 +304,6 @@ def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     store.close()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [(b"no database at all, only text " * 40, "expected an undamaged GaussLite store"), (None, "another program's")],
-)
-def test_a_foreign_file_is_one_clear_error(tmp_path: Path, content: bytes | None, message: str) -> None:
-    path = tmp_path / "foreign.sqlite"
-    if content is None:
-        with sqlite3.connect(path) as db:
-            db.execute("CREATE TABLE songs (title TEXT)")
-        db.close()
-    else:
-        path.write_bytes(content)
-    with pytest.raises(StorageError, match=message) as caught:
-        SqliteStore(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def _damaged(path: Path) -> None:
     store = SqliteStore(path)
     store.put(random_subset("ant", 1, dict.fromkeys(range(60), 40)))
@@ -331,23 +313,37 @@ def _damaged(path: Path) -> None:
     path.write_bytes(data)
 
 
-def _newer_schema(path: Path) -> None:
-    SqliteStore(path).close()
+def _execute(path: Path, statement: str) -> None:
     with sqlite3.connect(path) as db:
-        db.execute("PRAGMA user_version = 77")
+        db.execute(statement)
     db.close()
 
 
+def _newer_schema(path: Path) -> None:
+    SqliteStore(path).close()
+    _execute(path, "PRAGMA user_version = 77")
+
+
 @pytest.mark.parametrize(
-    ("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, f"to {SCHEMA_VERSION}, got 77")]
+    ("spoil", "message"),
+    [
+        (
+            lambda path: path.write_bytes(b"no database at all, only text " * 40),
+            "expected an undamaged GaussLite store",
+        ),
+        (lambda path: _execute(path, "CREATE TABLE songs (title TEXT)"), "another program's"),
+        (_damaged, "undamaged"),
+        (_newer_schema, f"to {SCHEMA_VERSION}, got 77"),
+    ],
 )
-def test_a_damaged_or_newer_store_is_one_clear_error(
+def test_a_foreign_damaged_or_newer_file_is_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:
     path = tmp_path / "store.sqlite"
     spoil(path)
     with pytest.raises(StorageError, match=message) as caught:
         SqliteStore(path)
+    assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -286,8 +286,8 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
     "numbers",
     [
         (signal.SIGTERM,),
-        pytest.param((signal.SIGHUP,), marks=hangup),
-        pytest.param((signal.SIGINT, signal.SIGINT, signal.SIGTERM), id="a launcher"),
+        pytest.param((signal.SIGHUP,), marks=[hangup, pytest.mark.slow]),
+        pytest.param((signal.SIGINT, signal.SIGINT, signal.SIGTERM), id="a launcher", marks=pytest.mark.slow),
     ],
 )
 def test_received_frames_give_a_map_and_a_report_on_signals(tmp_path: Path, numbers: tuple[signal.Signals]) -> None:

@@ -145,11 +145,10 @@ def test_a_refused_task_is_not_logged_as_an_error_that_nobody_has_looked_at() ->
     assert unseen == []
 
 
-def test_an_invalid_task_is_refused(robot: Agent) -> None:
-    with pytest.raises(TaskError):
-        robot.client.assign_task(" ")
-    with pytest.raises(TaskError, match="targets"):
-        robot.client.assign_task(TaskGraph("", "", (), (), ()))
+def test_an_invalid_task_and_frames_before_a_task_are_refused(robot: Agent) -> None:
+    pytest.raises(TaskError, robot.client.assign_task, " ")
+    pytest.raises(TaskError, robot.client.assign_task, TaskGraph("", "", (), (), ())).match("targets")
+    pytest.raises(MismatchError, lambda: list(robot.client.ingest([frame(0)]))).match("AssignTask")
     with pytest.raises(grpc.RpcError) as caught:
         robot.stub.AssignTask(pb.AssignTaskRequest())
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
@@ -161,11 +160,6 @@ def test_assign_task_raises_the_error_of_the_estimator() -> None:
 
     with agent(broken) as a, pytest.raises(ModelFileError, match=r"model\.onnx"):
         a.client.assign_task(TASK)
-
-
-def test_frames_need_a_task_first(robot: Agent) -> None:
-    with pytest.raises(MismatchError, match="AssignTask"):
-        list(robot.client.ingest([frame(0)]))
 
 
 def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() -> None:
