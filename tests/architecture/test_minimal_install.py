@@ -1,7 +1,5 @@
 """README's first command installs what it promises: nothing but a chosen option needs an optional package."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires

@@ -1,7 +1,5 @@
 """Images of a distorted lens become those of a pinhole, and frames state their motion."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The joint fit of lens, readout time and offset to moving pairs, against a simulated camera's truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mapping_scenes import wall_frame

@@ -1,7 +1,5 @@
 """Limits on the size of boxes, and small objects in enlarged tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """DepthSegmenter on synthetic surfaces: which pixels belong to the mask."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Settings of detectors and segmenters that are refused by name."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """YOLO networks end to end with known results: classes with masks, class-agnostic masks, and invalid files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

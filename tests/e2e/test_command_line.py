@@ -3,8 +3,6 @@
 A process of its own maps once; the other commands run in this process, which saves the start of each.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The example packages: each is installed from its folder, as its user would, and `gausslite map` uses it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

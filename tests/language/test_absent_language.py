@@ -1,7 +1,5 @@
 """Without this package a region is mapped, services start, and one line names the package where a sentence comes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

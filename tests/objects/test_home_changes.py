@@ -3,8 +3,6 @@
 `pytest -m slow -s tests/objects/test_home_changes.py` prints what was right, in parts, missed, unknown and wrong.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 

@@ -1,7 +1,5 @@
 """Without this package `map` works as before, and what needs the package names it in one line."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One robot in a wrong frame harms no others, and what it has caused ends with it: see bench/results for 20 seeds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from opened_stores import opener

@@ -1,7 +1,5 @@
 """Loops on a walk there and back with a drifting odometry: the trajectory, the map, and a resumed run."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

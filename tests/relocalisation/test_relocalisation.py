@@ -1,7 +1,5 @@
 """A robot that is lifted, covered or restarted is noticed and found again; one that drives on stays tracked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path

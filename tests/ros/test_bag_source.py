@@ -1,7 +1,5 @@
 """Bags give the same frames as the folder that they were made from, in every format of ROS 1 and ROS 2."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

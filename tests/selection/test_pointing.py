@@ -1,7 +1,5 @@
 """Regions that a person points at: their overlap with ground truth, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

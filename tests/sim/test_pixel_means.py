@@ -1,7 +1,5 @@
 """The colour of a simulated pixel is the mean over its area: within 40 dB of 64 rays, in the region of every object."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

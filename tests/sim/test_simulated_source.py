@@ -1,7 +1,5 @@
 """The two-room home is deterministic; its poses, masks and depths are exact; its trajectories overlap in part."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -4,8 +4,6 @@ Arguments: a folder for results, the import names of the packages of the extra `
 "all" to run more than what is quick.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io

@@ -1,7 +1,5 @@
 """Load the scripts of tools/ as modules."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from functools import cache

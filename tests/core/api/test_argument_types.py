@@ -1,7 +1,5 @@
 """Arguments of wrong types: one error that names the argument, what is right and what was received."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The public API: lazy imports, the same maps as the command line, and refused combinations."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

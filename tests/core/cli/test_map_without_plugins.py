@@ -1,7 +1,5 @@
 """`gausslite map` without the packages that score a run and show it: the map is complete, one line says what is not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The tests set limits in subprocesses. Sanitizers, which reserve terabytes of addresses, cannot run them.
 """
 
-from __future__ import annotations
-
 import sys
 
 import pytest

@@ -1,7 +1,5 @@
 """The agent service in this process: every call, every frame outcome, every status code."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import threading
@@ -124,8 +122,7 @@ def test_pointing_at_nothing_is_refused_and_changes_nothing(pointed: PointedObje
     with agent(no_detector) as a:
         a.client.assign_task(TASK)
         a.worker.submit(stepped(0)).result(20)
-        with pytest.raises(InvalidInputError, match=match):
-            a.client.assign_task(pointed=[pointed])
+        pytest.raises(InvalidInputError, a.client.assign_task, pointed=[pointed]).match(match)
         assert convert_task.graph_from_message(a.client.status().graph) == RuleParser().parse(TASK)
 
 
@@ -457,8 +454,7 @@ def test_an_upside_down_region_is_refused(robot: Agent) -> None:
     with pytest.raises(grpc.RpcError) as caught:
         next(robot.stub.WatchMap(request))
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
-    with pytest.raises(InvalidInputError, match="box"):
-        AxisAlignedBox((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    pytest.raises(InvalidInputError, AxisAlignedBox, (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)).match("box")
 
 
 def test_only_the_tasks_region_leaves_the_robot() -> None:
