@@ -1,7 +1,5 @@
 """Check the shapes in type annotations during every test, and locate optional data next to the project."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from pathlib import Path

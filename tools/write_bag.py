@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from gausslite.datasets.files import first_readable_size, read_rows
 from gausslite.datasets.tum import read_tum_camera
@@ -37,10 +39,7 @@ class BagWriter:
 
     def __init__(self, writer: Writer1 | Writer2, ros1: bool) -> None:
         self._writer, self._ros1 = writer, ros1
-        self._store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-        if ros1:
-            definition = get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
-            self._store.register(definition)
+        self._store = _typestore(ros1)
         self._connections: dict[str, Any] = {}
 
     @classmethod
@@ -90,6 +89,14 @@ class BagWriter:
             return [self._message(element, fields) for fields in value or []]
         array = np.zeros(length, element[0]) if value is None else np.asarray(value, element[0])
         return array.ravel()
+
+
+@functools.cache
+def _typestore(ros1: bool) -> Typestore:
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if ros1:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store
 
 
 def header(time_ns: int, frame: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
@@ -323,13 +324,22 @@ class BagFile:
 
 def _typestore(connection: Connection) -> Typestore:
     from rosbags.interfaces import MessageDefinitionFormat
+
+    is_message = connection.msgdef.format is MessageDefinitionFormat.MSG
+    definition = connection.msgdef.data if is_message else ""
+    return _typestore_of(definition, _type_of(connection), _is_ros1(connection))
+
+
+@lru_cache(maxsize=64)
+def _typestore_of(definition: str, message_type: str, is_ros1: bool) -> Typestore:
+    """Return the types of a definition, which rosbags parses and compiles; the standard ones for ""."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    if connection.msgdef.format is MessageDefinitionFormat.MSG and connection.msgdef.data:
+    if definition:
         store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(connection.msgdef.data, _type_of(connection)))
+        store.register(get_types_from_msg(definition, message_type))
         return store
-    if not _is_ros1(connection):
+    if not is_ros1:
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TF_MESSAGE))

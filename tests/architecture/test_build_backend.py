@@ -1,7 +1,5 @@
 """The folder in which `pip install` compiles: a second installation of a clone finds the objects of the first."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys

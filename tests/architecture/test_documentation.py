@@ -1,7 +1,5 @@
 """The documentation: links resolve, README's commands exist, and code names in backticks are in the sources."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

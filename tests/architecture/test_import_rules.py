@@ -1,7 +1,5 @@
 """The import rules of ARCHITECTURE.md: packages import downwards only, and importing a package loads nothing heavy."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from graphlib import TopologicalSorter

@@ -1,7 +1,5 @@
 """The core works without each package beside it, and a command of an absent package says which one it needs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

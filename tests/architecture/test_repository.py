@@ -1,7 +1,5 @@
 """Properties of the repository: README, file lengths, docstrings, calls, use of intrinsics, no unpickling."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

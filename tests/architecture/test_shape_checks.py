@@ -26,8 +26,7 @@ CAMERA = Camera.centred(10.0, 8, 6)
     ids=["shape", "type", "dimensions", "dataclass", "name of a type"],
 )
 def test_a_wrong_array_is_refused(call) -> None:
-    with pytest.raises(TypeCheckError):
-        call()
+    pytest.raises(TypeCheckError, call)
 
 
 @pytest.mark.parametrize(

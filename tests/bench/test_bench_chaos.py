@@ -1,7 +1,5 @@
 """A short chaos run with real processes, and the comparison that it rests on."""
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3

@@ -1,7 +1,5 @@
 """What a user can get wrong with a benchmark: one line that names it, exit code 2, and no work before it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,5 +70,4 @@ def test_a_wrong_option_is_one_line(
     [(lambda: HomeTeamPlan(1, 5), "agents"), (lambda: seed_rows(5), "at least 12, one per view, got 5")],
 )
 def test_a_wrong_argument_is_named(call: Callable[[], object], message: str) -> None:
-    with pytest.raises(InvalidInputError, match=message):
-        call()
+    pytest.raises(InvalidInputError, call).match(message)

@@ -1,7 +1,5 @@
 """The benchmark of lost robots: a robot that nobody watches is mapped at wrong poses, a watched one is not."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Counts and output of the loop benchmark on a few small frames; times are not asserted."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -40,8 +38,7 @@ def test_stages_skips_and_under_trained_frames_are_counted() -> None:
 
 
 def test_no_mapped_frame_is_an_error() -> None:
-    with pytest.raises(DatasetError, match="at least one frame with depth"):
-        loop_figures([])
+    pytest.raises(DatasetError, loop_figures, []).match("at least one frame with depth")
 
 
 @pytest.mark.parametrize("budget", [("--iterations", "2"), ("--rate", "200")])

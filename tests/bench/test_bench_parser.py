@@ -1,7 +1,5 @@
 """Scores of `bench parser` on sentences and parsers with known results."""
 
-from __future__ import annotations
-
 import itertools
 import json
 
@@ -58,5 +56,4 @@ def test_the_command_prints_its_figures(tmp_path, capsys):
 def test_a_file_of_another_kind_is_refused(tmp_path, text):
     path = tmp_path / "sentences.json"
     path.write_text(text)
-    with pytest.raises(InvalidInputError, match="expected"):
-        load_sentences(path)
+    pytest.raises(InvalidInputError, load_sentences, path).match("expected")

@@ -1,7 +1,5 @@
 """Scores of `bench perception` on a scene and detectors with known results."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The quality benchmark on one small home: tasks, trial keys, cached results and tables."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Measurements and output of the rasterizers' benchmark on tiny cases; times are not asserted."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The server benchmark on a small map, with a real server process."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from unittest.mock import patch

@@ -1,7 +1,5 @@
 """The team benchmark: a small home with two agents, and a recording in two parts."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

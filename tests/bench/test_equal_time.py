@@ -1,7 +1,5 @@
 """At equal time the rate of uniform mapping is measured once per study, unless a rate is given."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

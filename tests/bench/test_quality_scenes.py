@@ -1,7 +1,5 @@
 """Scenes of trials: masks match their frames, trial keys depend on the sequence, invalid input is refused early."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The trial cache: results of the running code."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a recording does not state has one answer: in Python, for `map`, and for `calibrate`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`gausslite calibrate` prints options that an agent's configuration takes as they are."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lens, readout time, time offset and exposure time of simulated cameras with a known truth."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,9 +1,8 @@
 """Poses or depth that contradict the images are refused with the convention, clock or unit that would agree."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -27,6 +26,12 @@ SIZE = (160, 120)
 NOTHING_ESTIMATED = StatedValues(correction=CameraCorrection(), pose_prior=PoseExposurePrior())
 
 
+@cache
+def frame_of(home: Source, position: int) -> Frame:
+    """Return a frame that is rendered once for all tests."""
+    return home.frame(position, SIZE)
+
+
 class Recording(WrappedSource):
     """Frames of a simulated home that state neither exact poses nor an ideal camera; 30 frames a second."""
 
@@ -35,7 +40,7 @@ class Recording(WrappedSource):
 
     def __init__(self, home: Source, positions: list[int]) -> None:
         super().__init__(home)
-        self.frames = [home.frame(position, SIZE) for position in positions]
+        self.frames = [frame_of(home, position) for position in positions]
         self.poses = np.array([frame.T_world_camera for frame in self.frames])
         self.depth_factor = 1.0
 
@@ -114,8 +119,7 @@ def test_another_convention_of_poses_is_named(recording: Recording, name: str) -
 )
 def test_another_unit_of_depth_is_named(recording: Recording, factor: float, words: str) -> None:
     recording.depth_factor = factor
-    with pytest.raises(DatasetError, match=f"depth {words} "):
-        calibrate(recording, NOTHING_ESTIMATED)
+    pytest.raises(DatasetError, calibrate, recording, NOTHING_ESTIMATED).match(f"depth {words} ")
 
 
 @pytest.mark.slow
@@ -167,8 +171,7 @@ def test_a_wrong_unit_that_the_files_do_not_state_is_noted(recording: Recording)
     assert "depth multiplied by" in note
     assert note.endswith("scale in the camera file of a folder, or as depth_unit=Xmm in the address of a bag")
     recording.poses = np.linalg.inv(recording.poses)
-    with pytest.raises(DatasetError, match="world-to-camera"):
-        calibrate(recording)
+    pytest.raises(DatasetError, calibrate, recording).match("world-to-camera")
 
 
 @pytest.mark.slow
@@ -224,8 +227,7 @@ def test_depth_images_with_swapped_bytes_are_refused(recording: Recording) -> No
         replace(frame, depth_m=depth_m.astype(np.float32))
         for frame, depth_m in zip(recording.frames, swapped, strict=True)
     ]
-    with pytest.raises(DatasetError, match="do not fit"):
-        calibrate(recording, NOTHING_ESTIMATED)
+    pytest.raises(DatasetError, calibrate, recording, NOTHING_ESTIMATED).match("do not fit")
 
 
 def test_poses_of_another_link_are_named(home: Source) -> None:
@@ -243,8 +245,7 @@ def test_depth_images_of_another_time_are_named(home: Source, late: int, words: 
     recording = Recording(home, list(range(24)))
     depths = [recording.frames[min(max(i - late, 0), 23)].depth_m for i in range(24)]
     recording.frames = [replace(frame, depth_m=depth) for frame, depth in zip(recording.frames, depths, strict=True)]
-    with pytest.raises(DatasetError, match=f"depth images {words} would agree"):
-        calibrate(recording, NOTHING_ESTIMATED)
+    pytest.raises(DatasetError, calibrate, recording, NOTHING_ESTIMATED).match(f"depth images {words} would agree")
 
 
 @pytest.mark.slow

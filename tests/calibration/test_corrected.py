@@ -1,7 +1,5 @@
 """Images of a distorted lens become those of a pinhole, and frames state their motion."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -55,7 +53,7 @@ def test_a_distorted_image_becomes_that_of_a_pinhole(text: str) -> None:
 
 def test_rows_of_a_rolling_shutter_are_brought_to_one_time() -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
-    spec = "sim:home-1?frames=40&noise=0&exposure=0&size=200x150&speed=100"
+    spec = "sim:home-1?frames=40&noise=0&exposure=0&size=120x90&speed=100"
     still, rolling = open_source(spec), open_source(f"{spec}&shutter=30ms")
     corrected = CorrectedSource(rolling, CameraCorrection(readout_s=0.03)).rectified()
     errors = []

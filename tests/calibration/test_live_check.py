@@ -1,7 +1,5 @@
 """What `map` refuses of a recording, live frames are refused for as well, by the same comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Frames of a live camera are corrected by their own motion and lens, as recorded frames are by the trajectory."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

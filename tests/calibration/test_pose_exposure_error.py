@@ -1,7 +1,5 @@
 """The estimated prior is exact for exact poses, and about as large as the true errors otherwise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Depth registered to a colour camera: exact on planes, empty in occlusion shadows; invalid texts are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -140,8 +138,7 @@ def test_a_roll_rotates_the_image_from_right_to_down() -> None:
              "525,525,320,240,0,0,0,0,0,90", "525,525,320,240,0,0,0,0,0,nan"],
 )  # fmt: skip
 def test_an_invalid_text_is_rejected_in_one_line(text: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"^depth registration: expected [^\n]*$"):
-        DepthRegistration.parse(text)
+    pytest.raises(InvalidInputError, DepthRegistration.parse, text).match(r"^depth registration: expected [^\n]*$")
 
 
 def test_the_agent_passes_the_registration_to_its_source() -> None:

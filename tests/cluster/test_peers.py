@@ -1,7 +1,5 @@
 """Calls to the other servers of a mission end, whatever these do."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 from typing import Any

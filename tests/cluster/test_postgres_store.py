@@ -1,7 +1,5 @@
 """The store in PostgreSQL: what is acknowledged survives lost connections and a killed database."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from threading import Thread
@@ -93,8 +91,7 @@ def test_a_database_is_used_by_one_server_alone_or_shared_with_one_owner_of_each
     assert two.take({2, 3}) == {2, 3}
     end_connections(url)
     # the locks are gone, so its rows are not its own any more
-    with pytest.raises(UnavailableError, match="was lost"):
-        store.put(random_subset("ant", 2, {key: 3}))
+    pytest.raises(UnavailableError, store.put, random_subset("ant", 2, {key: 3})).match("was lost")
     store.close()
     assert two.owners().servers == ("one:1", "two:1")
     assert two.take({1, 2, 3, 4}) == {1, 2, 3, 4}

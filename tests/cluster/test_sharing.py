@@ -1,7 +1,5 @@
 """Several servers of one database: any accepts any agent, each stores its regions alone, and the map is that of one."""
 
-from __future__ import annotations
-
 import asyncio
 import random
 import signal
@@ -221,8 +219,7 @@ def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[Sha
     session = one.join("ant", GRID, task=GRAPH).session_id
     subsets = [scattered("ant", seq, seq) for seq in (1, 2)]
     list(two.contribute([request(session, subset) for subset in subsets], 20.0))
-    with pytest.raises(NameInUseError):
-        three.join("ant", GRID)
+    pytest.raises(NameInUseError, three.join, "ant", GRID)
     assert [client.keep_session(session).highest_update_seq for client in (one, two, three)] == [2, 2, 2]
     digests = [client.stored_digests(session) for client in (one, two, three)]
     latest = np.concatenate([np.full(len(own.batch), own.update_seq, np.int64) for own in subsets])
@@ -244,19 +241,16 @@ def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[Sha
     assert [(agent.keyframes, list(agent.targets)) for agent in one.status().agents] == [(2, ["mug"])]
     with pytest.raises(MismatchError, match="several share this mission"):
         next(one.refine())
-    with pytest.raises(MismatchError, match="several share this mission"):
-        one.render(CAMERA, np.eye(4))
+    pytest.raises(MismatchError, one.render, CAMERA, np.eye(4)).match("several share this mission")
     assert two.evict("ant", ban=True) == len(last)
     assert [client.status().fused_voxels for client in (one, two, three)] == [0, 0, 0]
     assert [len(client.query_objects()) for client in (one, two, three)] == [0, 0, 0]
     with pytest.raises(SessionUnknownError):
         list(two.contribute([request(session, subsets[0])], 20.0))
-    with pytest.raises(NotPermittedError, match="banned"):
-        one.join("ant", GRID)
+    pytest.raises(NotPermittedError, one.join, "ant", GRID).match("banned")
     assert list(three.status().banned_agents) == ["ant"]
     three.unban("ant")
-    with pytest.raises(InvalidInputError):
-        one.evict("nobody")
+    pytest.raises(InvalidInputError, one.evict, "nobody")
     assert two.join("ant", GRID).highest_update_seq == 0
 
 
@@ -391,8 +385,7 @@ def test_with_certificates_only_servers_call_each_other(postgres: PostgresServer
         assert one.client.export(Export()) == offline({"ant": subsets})
         assert one.share.counts().stored
         assert two.share.counts().stored
-        with pytest.raises(NotPermittedError):
-            one.client.join("bee", GRID)
+        pytest.raises(NotPermittedError, one.client.join, "bee", GRID)
         with open_channel(one.address, robot) as channel, pytest.raises(grpc.RpcError) as refused:
             RegionServiceStub(channel).RemoveAgent(RemoveAgentRequest(agent_id="ant"))
         assert refused.value.code() is grpc.StatusCode.PERMISSION_DENIED

@@ -1,7 +1,5 @@
 """Servers that share a database which fails: what they have acknowledged is in the map, and they go on with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Fixtures that run the contract on every backend of this machine."""
 
-from __future__ import annotations
-
 import hashlib
 import pickle
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Scenes that all backends must render alike, with valid and invalid rows, and the pixels that tests compare."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property

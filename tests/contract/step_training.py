@@ -1,7 +1,5 @@
 """One training step on a scene, with the tables before and after it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Contract of `backward`: gradients match the oracle."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from splat_scenes import (

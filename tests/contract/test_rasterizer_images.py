@@ -1,7 +1,5 @@
 """Contract of `forward`: images match the oracle."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from splat_scenes import CAMERA, SCENES, Scene, named_scene, random_rows, relative_error, rotated_pose, scene_for

@@ -1,7 +1,5 @@
 """Contract of a moving camera: rolling shutter and motion blur, in images, gradients and training steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Properties of the image model, for random splats and all backends."""
 
-from __future__ import annotations
-
 import numpy as np
 from few_examples import few_examples
 from hypothesis import given

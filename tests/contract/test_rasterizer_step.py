@@ -1,7 +1,5 @@
 """Contract of the training step: forward, loss, backward and Adam on visible, trainable rows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -205,6 +203,5 @@ def test_tables_are_written_back_after_an_exception(rasterizer: Rasterizer, orac
             rasterizer.step(*bound, view, scene.T_camera_world, LOSS, ADAM)
             raise KeyError("test")
 
-    with pytest.raises(KeyError):
-        step_and_raise()
+    pytest.raises(KeyError, step_and_raise)
     assert bound[0][:, UPDATE_COUNT].max() == 1

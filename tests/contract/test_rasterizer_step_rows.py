@@ -1,7 +1,5 @@
 """A step changes only visible, trainable rows, counts their updates, and rejects invalid tables."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

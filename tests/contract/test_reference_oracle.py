@@ -1,7 +1,5 @@
 """The torch oracle against finite differences and against direct sums."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The C++ programs against real services: a mission from a folder, and the fused map as the Python client gets it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

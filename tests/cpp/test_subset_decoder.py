@@ -1,7 +1,5 @@
 """The C++ decoder, written from docs/reference/wire.md, gives the Python decoder's values and refuses damage."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A small demo: four processes, two missions, one fused map, and no process left running."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

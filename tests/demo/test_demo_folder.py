@@ -1,7 +1,5 @@
 """`gausslite demo` refuses the folder of an earlier demo, or replaces its results."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -17,8 +15,7 @@ def test_a_used_folder_is_refused(name: str, tmp_path: Path, capsys: pytest.Capt
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"x")
-    with pytest.raises(StorageError, match="exists already"):
-        require_no_demo(tmp_path)
+    pytest.raises(StorageError, require_no_demo, tmp_path).match("exists already")
     assert main(["demo", "--out", str(tmp_path)]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert line.endswith(f"{name} exists already; choose another --out, or replace it with --overwrite")

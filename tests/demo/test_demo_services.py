@@ -1,7 +1,5 @@
 """The demo reports the failure of a service, and configures agents by files that restore the settings."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

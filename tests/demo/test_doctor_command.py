@@ -1,7 +1,5 @@
 """`gausslite doctor`: findings agree with the machine, faults are errors with exit code 1, and no socket connects."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

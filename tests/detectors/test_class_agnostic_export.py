@@ -1,7 +1,5 @@
 """The exported outputs of a tiny random network with FastSAM's interface equal those of torch."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

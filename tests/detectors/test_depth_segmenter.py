@@ -1,12 +1,9 @@
 """DepthSegmenter on synthetic surfaces: which pixels belong to the mask."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite_detectors.depth_segmenter import DepthSegmenter, DepthSegmenterSettings
 
@@ -88,11 +85,3 @@ def test_without_depth_in_the_centre_there_is_no_mask():
     assert segment(depth_m) == [None]
     outside = np.array([[200, 200, 240, 240], [50, 50, 50, 60]], np.float32)
     assert segment(np.ones((80, 100)), boxes=outside) == [None, None]
-
-
-def test_settings_are_checked():
-    for name in ("depth_step", "colour_step"):
-        with pytest.raises(InvalidInputError, match=name):
-            DepthSegmenterSettings(**{name: float("nan")})
-    with pytest.raises(InvalidInputError, match="side_px"):
-        DepthSegmenterSettings(side_px=1)

@@ -1,7 +1,5 @@
 """Small random Grounding DINO and CLIP text encoder: the files that tools/export_model.py writes equal torch."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

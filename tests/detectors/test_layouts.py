@@ -1,7 +1,5 @@
 """Files of many exporters: each finds the same cup, or is refused by name with the line that exports it right."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Model files are listed and inspected, and each has a source whose commands can be pasted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Model families of files, and the detector built from the options."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -67,8 +65,7 @@ def test_boxes_with_class_names_get_masks_from_depth(tmp_path):
     assert (found.phrase, found.score) == ("mug", pytest.approx(0.8))
     assert found.box_px == pytest.approx((32, 16, 64, 48))
     assert found.mask.sum() == 24 * 24
-    with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
-        opened(path, "yolo")
+    pytest.raises(InvalidInputError, opened, path, "yolo").match("finds boxes only; expected depth or a FastSAM file")
     with pytest.raises(InvalidInputError, match=r"expected depth or a FastSAM file, got .*world\.onnx"):
         opened(path, str(path))
 
@@ -135,10 +132,8 @@ def test_boxes_without_a_mask_are_dropped():
 
 def test_grounding_dino_needs_a_vocabulary_and_has_no_masks(tmp_path):
     path = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
-    with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
-        opened(path, "yolo")
-    with pytest.raises(ModelFileError, match=r"vocab\.txt"):
-        opened(path)
+    pytest.raises(InvalidInputError, opened, path, "yolo").match("finds boxes only; expected depth or a FastSAM file")
+    pytest.raises(ModelFileError, opened, path).match(r"vocab\.txt")
 
 
 def test_grounding_dino_with_a_vocabulary_detects_and_segments(tmp_path):
@@ -175,12 +170,10 @@ def test_a_gpu_provider_is_preferred_and_the_cpu_is_the_fallback():
 def test_invalid_files_are_rejected_before_a_session_is_made(tmp_path, content, expected):
     path = tmp_path / "model.onnx"
     path.write_bytes(content)
-    with pytest.raises(ModelFileError, match=expected):
-        open_model(path, 1)
+    pytest.raises(ModelFileError, open_model, path, 1).match(expected)
 
 
 def test_a_damaged_bit_is_detected_by_a_listed_checksum(tmp_path):
     path = yolo(tmp_path)
     (tmp_path / "SHA256SUMS").write_text(f"{'0' * 64}  other.onnx\n{'1' * 64} *yolo.onnx\n", encoding="utf-8")
-    with pytest.raises(ModelFileError, match="of SHA256SUMS in its folder"):
-        opened(path)
+    pytest.raises(ModelFileError, opened, path).match("of SHA256SUMS in its folder")

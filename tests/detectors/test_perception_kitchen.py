@@ -1,7 +1,5 @@
 """The real detector on a real kitchen, with the two tasks of the demo."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

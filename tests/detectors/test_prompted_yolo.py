@@ -1,7 +1,5 @@
 """Detectors whose classes are text features: every number of the decoded boxes, the text encoder, and invalid files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -131,22 +129,19 @@ def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):
     encoder(tmp_path)
     found = opened(path).detect(frame(), ["mug"])
     assert found[0].box_px == pytest.approx((32, 16, 64, 48), abs=1e-4)
-    with pytest.raises(InvalidInputError, match="finds boxes only"):
-        opened(path, "yolo")
+    pytest.raises(InvalidInputError, opened, path, "yolo").match("finds boxes only")
     with pytest.raises(ModelFileError, match="expected a detector, got a text encoder"):
         opened(tmp_path / "text_encoder.onnx")
 
 
 def test_missing_and_wrong_text_files_are_named(tmp_path):
     path = write_prompted(tmp_path / "world.onnx", BOXES, anchors())
-    with pytest.raises(ModelFileError, match=r"expected text_encoder\.onnx and tokenizer\.json, or lvis"):
-        opened(path)
+    pytest.raises(ModelFileError, opened, path).match(r"expected text_encoder\.onnx and tokenizer\.json, or lvis")
     write_text_encoder(tmp_path / "text_encoder.onnx")
     with pytest.raises(ModelFileError, match=r"tokenizer\.json: expected a JSON file of up to 16 MiB, found none"):
         opened(path)
     (tmp_path / "tokenizer.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(ModelFileError, match=r"tokenizer\.json: expected a tokenizer in JSON"):
-        opened(path)
+    pytest.raises(ModelFileError, opened, path).match(r"tokenizer\.json: expected a tokenizer in JSON")
     with pytest.raises(ModelFileError, match="expected a text encoder with projected text features"):
         encoder(tmp_path, output="pooler_output")
     with pytest.raises(ModelFileError, match=r"expected token ids \[n, length\], got images"):

@@ -1,7 +1,5 @@
 """YOLO networks end to end with known results: classes with masks, class-agnostic masks, and invalid files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +9,7 @@ import pytest
 from tiny_yolo import write_boxes_only, write_tiny_yolo
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError, ModelFileError
+from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
@@ -21,7 +19,6 @@ from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSett
 from gausslite_detectors.boxes import BoxSizeLimits
 from gausslite_detectors.class_detector import (
     ClassAgnosticSegmenter,
-    ClassAgnosticSettings,
     ClassDetector,
     ClassDetectorSettings,
     load_class_detector,
@@ -299,15 +296,6 @@ def test_a_model_without_class_names_is_refused(tmp_path):
     )
 
 
-def test_settings_are_checked():
-    with pytest.raises(InvalidInputError, match="detector min_score: expected between 0 and 1"):
-        ClassDetectorSettings(min_score=1.5)
-    with pytest.raises(InvalidInputError, match="box limit scale: expected a positive number"):
-        BoxSizeLimits(scale=0.0)
-    with pytest.raises(InvalidInputError, match="box limit min_known_share: expected 0 to 1"):
-        BoxSizeLimits(min_known_share=1.5)
-
-
 def _refused(path: Path, expected: str) -> None:
     with pytest.raises(ModelFileError, match=expected) as caught:
         detector_from(path)
@@ -360,11 +348,3 @@ def test_no_boxes_give_no_masks(tmp_path):
 def test_a_network_of_many_classes_has_a_lower_threshold(tmp_path):
     (mask,) = masks(tmp_path, (*SURE[:5], 0.04), names=("cup", "chair"))
     assert mask is not None
-
-
-def test_settings_of_the_segmenter_are_checked():
-    for name in ("min_score", "nms_max_iou", "min_box_iou"):
-        with pytest.raises(InvalidInputError, match=name):
-            ClassAgnosticSettings(**{name: 1.0})
-    with pytest.raises(InvalidInputError, match="max_masks"):
-        ClassAgnosticSettings(max_masks=0)

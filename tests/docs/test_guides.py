@@ -4,8 +4,6 @@ Options that a command leaves out come from the environment. The ports of a page
 marked with `<!-- test: service -->` is a service that serves the following blocks.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The notebook runs from its first to its last cell, and shows pictures and scores."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

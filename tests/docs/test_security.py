@@ -1,7 +1,5 @@
 """docs/security.md: each claim names tests that exist."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

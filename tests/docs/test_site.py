@@ -1,7 +1,5 @@
 """The documentation site: it builds without warnings, and its pages load nothing from other hosts."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -55,6 +53,7 @@ def test_a_page_that_loads_from_another_host_is_found(loading: str) -> None:
     assert LOADED_BY_HTML.search(loading)
 
 
+@pytest.mark.slow
 def test_readme_is_the_home_page_and_its_links_lead_to_pages(site: Path) -> None:
     home = (site / "index.html").read_text(encoding="utf-8")
     assert 'href="architecture.html"' in home
@@ -63,6 +62,7 @@ def test_readme_is_the_home_page_and_its_links_lead_to_pages(site: Path) -> None
     assert 'href="results/index.html"' in home
 
 
+@pytest.mark.slow
 def test_the_reference_has_the_public_names_and_all_commands(site: Path) -> None:
     python = (site / "reference" / "python.html").read_text(encoding="utf-8")
     commands = (site / "reference" / "commands.html").read_text(encoding="utf-8")

@@ -3,8 +3,6 @@
 A process of its own maps once; the other commands run in this process, which saves the start of each.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import subprocess
@@ -19,8 +17,8 @@ from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply
 from gausslite_view.map_history import read_map_history
 
-HOME = "sim:home?seed=0&trajectory=0&frames=12"
-SMALL = ("--size", "160x120", "--max-gaussians", "6000", "--iterations", "4")
+HOME = "sim:home?seed=0&trajectory=0&frames=12&size=160x120"
+SMALL = ("--max-gaussians", "6000", "--iterations", "4")
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
@@ -71,7 +69,7 @@ def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
 @pytest.mark.slow
 def test_eval_prints_lpips_with_a_file_of_it(mug_map: Path, shared_dir: Path) -> None:
     file = shared_dir / "models" / "lpips_squeeze.onnx"
-    ball = ("--size", "160x120", "--test-every", "4", "--set", "target-at=2,2,0.8,0.5")
+    ball = ("--test-every", "4", "--set", "target-at=2,2,0.8,0.5")
     done = gausslite("eval", mug_map / "map.ply", HOME, *ball, "--set", f"lpips-weights={file}", "--json")
     scores = json.loads(done.stdout)
     assert 0.0 < scores["roi_lpips"] < scores["full_lpips"] < 1.0
@@ -80,7 +78,7 @@ def test_eval_prints_lpips_with_a_file_of_it(mug_map: Path, shared_dir: Path) ->
 
 
 def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
-    options = ("--size", "160x120", "--test-every", "4", "--set", "target-at=2,2,0.8,0.5")
+    options = ("--test-every", "4", "--set", "target-at=2,2,0.8,0.5")
     done = gausslite("eval", mug_map / "map.ply", HOME, *options, "--json")
     assert done.returncode == 0, done.stderr
     scores = json.loads(done.stdout)

@@ -1,7 +1,5 @@
 """A robot's whole mission over gRPC, by a client that is written only from the protos; also with a killed agent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A program interrupted during its start prints one line and returns a known code."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

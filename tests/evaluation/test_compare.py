@@ -1,7 +1,5 @@
 """Scores of maps on held-out views."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -129,5 +127,4 @@ def test_regions_are_merged_into_one_mask() -> None:
 
 
 def test_no_views_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="held-out views"):
-        evaluate(wall(), [], ReferenceRasterizer())
+    pytest.raises(InvalidInputError, evaluate, wall(), [], ReferenceRasterizer()).match("held-out views")

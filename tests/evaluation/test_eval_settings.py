@@ -1,7 +1,5 @@
 """`gausslite eval` uses the settings in the report next to the map, unless options override them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """LPIPS: which pixels are compared, in which range, and what is said of a wrong file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Metrics against their definitions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -92,5 +90,4 @@ def test_coverage_counts_the_measured_pixels_alone() -> None:
 def test_images_that_do_not_match_are_refused() -> None:
     with pytest.raises(ShapeError, match="uint8 or floating"):
         psnr(np.zeros((4, 4, 3), np.int32), np.zeros((4, 4, 3), np.int32))
-    with pytest.raises(InvalidInputError, match="at least one pixel"):
-        ssim(image(0), image(1), np.zeros((20, 24), np.bool_))
+    pytest.raises(InvalidInputError, ssim, image(0), image(1), np.zeros((20, 24), np.bool_)).match("at least one pixel")

@@ -1,7 +1,5 @@
 """Comparison sheets show every map next to the ground truth; images are written as PNG."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Sharpness metrics against their definitions."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

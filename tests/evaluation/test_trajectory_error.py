@@ -1,7 +1,5 @@
 """ATE: independent of a rigid motion, equal to the noise, and None where trajectories share no times."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,17 +1,17 @@
 """The example packages: each is installed from its folder, as its user would, and `gausslite map` uses it."""
 
-from __future__ import annotations
-
 import json
-import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from other_process import environment_with, run_python
 from pip_installed import install
 from tiny_sequences import FEW_GAUSSIANS, write_tum
+
+from gausslite import plugins
+from gausslite.cli.main import main
 
 pytest.importorskip("setuptools", reason="the examples are built with setuptools, which is not installed")
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -26,8 +26,17 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def gausslite(installed: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return run_python("-m", "gausslite", *arguments, environment=environment_with(installed), timeout_s=240)
+@pytest.fixture(autouse=True)
+def found(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let this process find the examples, as one that starts after their installation."""
+    monkeypatch.syspath_prepend(installed)
+    plugins._entry_points.cache_clear()
+    yield
+    plugins._entry_points.cache_clear()
+
+
+def gausslite(*arguments: str | Path) -> int:
+    return main([str(argument) for argument in arguments])
 
 
 def write_red_cup(folder: Path) -> Path:
@@ -41,18 +50,17 @@ def write_red_cup(folder: Path) -> Path:
     return folder
 
 
-def test_a_detector_of_another_package_finds_the_target(installed: Path, tmp_path: Path) -> None:
+def test_a_detector_of_another_package_finds_the_target(tmp_path: Path) -> None:
     sequence, out, things = write_red_cup(tmp_path / "fr1_cup"), tmp_path / "out", tmp_path / "things.colours"
     things.write_text("cup 190 25 30\nball 20 20 200\n")
     command = ("map", sequence, *FEW_GAUSSIANS, "--task", "Pick up the cup", "--detector", things, "--out", out)
-    done = gausslite(installed, *command)
-    assert done.returncode == 0, done.stderr
+    assert gausslite(*command) == 0
     report = json.loads((out / "report.json").read_text())
     assert [(found["noun"], found["confirmed_objects"]) for found in report["nouns"]] == [("cup", 1)]
     assert report["active_gaussians"] > 0
 
 
-def test_a_recording_of_another_packages_format_is_mapped(installed: Path, tmp_path: Path) -> None:
+def test_a_recording_of_another_packages_format_is_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3), dtype=np.uint8)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = np.arange(3) / 20
@@ -64,21 +72,21 @@ def test_a_recording_of_another_packages_format_is_mapped(installed: Path, tmp_p
     }
     np.savez(tmp_path / "run.npz", camera=(30.0, 30.0, 16.0, 12.0), **arrays)
     for name, address in (("by_suffix", tmp_path / "run.npz"), ("by_name", f"npz:{tmp_path / 'run.npz'}")):
-        done = gausslite(installed, "map", address, *FEW_GAUSSIANS, "--out", tmp_path / name)
-        assert done.returncode == 0, done.stderr
+        assert gausslite("map", address, *FEW_GAUSSIANS, "--out", tmp_path / name) == 0
         assert json.loads((tmp_path / name / "report.json").read_text())["frames"] == 3
     (tmp_path / "broken.npz").write_bytes(b"PK")
-    done = gausslite(installed, "map", tmp_path / "broken.npz", "--out", tmp_path / "broken")
-    assert done.returncode == 2
-    assert "broken.npz: expected the arrays rgb, depth_m" in done.stderr.splitlines()[-1]
+    assert gausslite("map", tmp_path / "broken.npz", "--out", tmp_path / "broken") == 2
+    assert "broken.npz: expected the arrays rgb, depth_m" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_file_that_no_reader_knows_is_refused_by_the_default_reader(installed: Path, tmp_path: Path) -> None:
+def test_a_file_that_no_reader_knows_is_refused_by_the_default_reader(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "notes.txt").write_text("no model")
     command = ("map", write_tum(tmp_path / "fr1_cup"), "--task", "Pick up the cup", "--out", tmp_path / "out")
-    done = gausslite(installed, *command, "--detector", tmp_path / "notes.txt")
-    assert done.returncode == 2
-    assert "notes.txt: expected a readable ONNX model, got" in done.stderr.splitlines()[-1]
-    advice = gausslite(installed, *command).stderr.splitlines()[-1]
+    assert gausslite(*command, "--detector", tmp_path / "notes.txt") == 2
+    assert "notes.txt: expected a readable ONNX model, got" in capsys.readouterr().err.splitlines()[-1]
+    assert gausslite(*command) == 2
+    advice = capsys.readouterr().err.splitlines()[-1]
     assert "expected --detector FILE.onnx" in advice
     assert "write FILE.colours" in advice

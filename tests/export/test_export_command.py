@@ -19,7 +19,7 @@ from gausslite_export.format import Format
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("export") / "run"
-    arguments = ["map", "sim:home", "--task", "Pick up the mug on the table", "--size", "160x120", "--frames", "0:12"]
+    arguments = ["map", "sim:home?frames=8&size=160x120", "--task", "Pick up the mug on the table"]
     assert main([*arguments, "--iterations", "2", "--out", str(folder)]) == 0
     return folder
 

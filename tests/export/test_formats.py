@@ -228,8 +228,7 @@ def test_a_map_beyond_the_grid_is_refused_before_memory_is_taken(tmp_path, name,
     room = plate(0.5)
     means_m = room.means_m.copy()
     means_m[::2, :2] += 5000
-    with pytest.raises(InvalidInputError, match=message):
-        export(tmp_path, name, dataclasses.replace(room, means_m=means_m))
+    pytest.raises(InvalidInputError, export, tmp_path, name, dataclasses.replace(room, means_m=means_m)).match(message)
 
 
 def test_too_many_samples_of_large_gaussians_are_refused(tmp_path):
@@ -324,19 +323,9 @@ def test_a_map_with_another_up_is_turned_until_z_points_up(up):
         upright(MapContent(turned, turned, report={"up": "north"}))
 
 
-def test_a_map_without_a_region_names_the_option(tmp_path):
-    gaussians = random_map()
-    inactive = dataclasses.replace(gaussians, active=np.zeros(COUNT, np.bool_))
-    with pytest.raises(InvalidInputError, match="--region all"):
-        export(tmp_path, "octomap", inactive, region="roi")
-
-
-def test_a_folder_without_a_map_is_refused(tmp_path):
-    with pytest.raises(MapFileError, match=r"map\.ply"):
-        read_map(tmp_path, "all")
-
-
-def test_damaged_keyframes_are_one_clear_error(tmp_path):
+def test_a_map_without_a_region_or_file_and_damaged_keyframes_are_refused(tmp_path):
+    inactive = dataclasses.replace(random_map(), active=np.zeros(COUNT, np.bool_))
+    pytest.raises(MapFileError, read_map, tmp_path, "all").match(r"map\.ply")
+    pytest.raises(InvalidInputError, export, tmp_path, "octomap", inactive, region="roi").match("--region all")
     (tmp_path / "keyframes.json").write_text('{"keyframes": [{"index": 1}]}')
-    with pytest.raises(MapFileError, match="keyframes"):
-        read_keyframe_views(tmp_path)
+    pytest.raises(MapFileError, read_keyframe_views, tmp_path).match("keyframes")

@@ -1,7 +1,5 @@
 """Writers of libraries that report no full disk: an incomplete file is an error, and it is removed."""
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager

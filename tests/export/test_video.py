@@ -1,7 +1,5 @@
 """A fly-through video: its length, its pictures, and the path between keyframes."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,41 +1,34 @@
 """Without this package a region is mapped, services start, and one line names the package where a sentence comes."""
 
-from __future__ import annotations
-
-import os
-import subprocess
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from absent_package import remove_package
+from other_process import environment_without, run_python
 
+from gausslite.cli.main import main
 from gausslite.nouns import PlainNouns, meant_by, vocabulary
 from gausslite_language import nouns
 
-HIDING = Path(__file__).resolve().parents[1] / "support" / "without_extras"
 MISSING = "needs the package gausslite_language, which is not installed"
-FRAMES = ("sim:home", "--frames", "0:2", "--size", "160x120", "--out")
+FRAMES = ("sim:home?frames=2&size=80x60", "--out")
 
 
-def run_without_language(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join(filter(None, (str(HIDING), os.environ.get("PYTHONPATH"))))
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": path, "HIDDEN_PACKAGES": "gausslite_language"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+@pytest.fixture
+def without_language(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    remove_package(monkeypatch, "gausslite_language")
+    vocabulary.cache_clear()
+    yield
+    vocabulary.cache_clear()
 
 
+@pytest.mark.usefixtures("without_language")
 def test_regions_are_mapped(tmp_path: Path) -> None:
     regions, out = tmp_path / "regions.npz", tmp_path / "run"
     np.savez(regions, voxel_size_m=1.0, wall=np.argwhere(np.ones((6, 6, 3))))
-    done = run_without_language("-m", "gausslite", "map", *FRAMES, out, "--roi", regions)
-    assert done.returncode == 0, done.stderr
+    assert main(["map", *FRAMES, str(out), "--roi", str(regions)]) == 0
     assert (out / "map.ply").is_file()
 
 
@@ -50,8 +43,9 @@ def test_regions_are_mapped(tmp_path: Path) -> None:
     ],
 )
 def test_one_line_names_the_package_where_it_is_needed(arguments: Sequence[str], tmp_path: Path) -> None:
+    # in a process of its own: this one may keep a parser from before
     out = [str(tmp_path / text) if text == "run" else text for text in arguments]
-    done = run_without_language("-m", *out)
+    done = run_python("-m", *out, environment=environment_without("gausslite_language"))
     assert done.returncode == 2, done.stderr
     assert done.stderr.splitlines()[-1].endswith(MISSING)
     assert "Traceback" not in done.stderr
@@ -59,7 +53,7 @@ def test_one_line_names_the_package_where_it_is_needed(arguments: Sequence[str],
 
 def test_services_and_their_settings_are_imported() -> None:
     modules = "gausslite.api, gausslite_agent.program, gausslite_fusion_server.program, gausslite_parser.program"
-    done = run_without_language("-c", f"import {modules}")
+    done = run_python("-c", f"import {modules}", environment=environment_without("gausslite_language"))
     assert done.returncode == 0, done.stderr
 
 

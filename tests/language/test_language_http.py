@@ -1,7 +1,5 @@
 """The http backend against a local server that is correct, slow, hostile or broken."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 Needs onnxruntime-genai, transformers, tokenizers and torch; GAUSSLITE_ONNX_TASKS=200 sets the number of tasks.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
@@ -86,8 +84,7 @@ def test_a_failed_answer_falls_back_to_rules_with_a_warning(tiny: Path) -> None:
 def test_a_damaged_model_is_refused(tiny: Path, tmp_path: Path) -> None:
     config = json.loads((tiny / "genai_config.json").read_text())
     (tmp_path / "genai_config.json").write_text(json.dumps(config))
-    with pytest.raises(ModelFileError, match="fails to load"):
-        OnnxLanguageModel(tmp_path)
+    pytest.raises(ModelFileError, OnnxLanguageModel, tmp_path).match("fails to load")
 
 
 def test_a_task_cannot_inject_another_role() -> None:

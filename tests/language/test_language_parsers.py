@@ -1,7 +1,5 @@
 """Answers of language models are grounded in the sentence; otherwise the rules parse the task."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 
@@ -187,8 +185,7 @@ def test_any_answer_gives_a_graph_of_the_sentence_or_is_refused(text):
 
 def test_an_invalid_task_is_refused_before_the_model_is_called():
     model = ScriptedModel(answer())
-    with pytest.raises(TaskError, match="names an object"):
-        LanguageParser(model).parse("!?")
+    pytest.raises(TaskError, LanguageParser(model).parse, "!?").match("names an object")
     assert model.requests == []
 
 
@@ -198,8 +195,7 @@ def test_answers_are_cached_failures_are_not_and_the_cache_is_bounded():
     assert parser.parse(TASK) is parser.parse(TASK)
     assert len(model.requests) == 1
     for _ in range(2):
-        with pytest.raises(LanguageModelError):
-            parser.parse("Find the table")
+        pytest.raises(LanguageModelError, parser.parse, "Find the table")
     model.answers = [answer(["table"], []), answer(["mug"], [])]
     parser.parse("Find the table")
     parser.parse(TASK)

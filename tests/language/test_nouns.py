@@ -1,7 +1,5 @@
 """Which named objects of a scene a task's noun means."""
 
-from __future__ import annotations
-
 from importlib import resources
 
 import pytest

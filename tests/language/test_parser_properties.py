@@ -1,7 +1,5 @@
 """For any text, the parser returns a graph within the limits or raises a one-line error."""
 
-from __future__ import annotations
-
 from hypothesis import example, given
 from hypothesis import strategies as st
 

@@ -1,7 +1,5 @@
 """Part-of-speech tags depend on neighbouring words; the Viterbi path has the least cost of all paths."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Send-back: an agent inserts what a teammate trained in the region of its task, and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -93,8 +91,7 @@ def test_blocks_after_an_error_are_read_again(server: RunningServer, monkeypatch
             return insert(batch)
 
         monkeypatch.setattr(worker, "insert_team_voxels", insert_or_fail)
-        with pytest.raises(UnavailableError):
-            follower.follow_once()
+        pytest.raises(UnavailableError, follower.follow_once)
         assert local().kappa.tolist() == [5]
         follower.follow_once()
         assert sorted(local().kappa.tolist()) == [5, 7]

@@ -1,7 +1,5 @@
 """A run's folder of a room made by hand: a floor, a wall with a gap, a table, and a red box on it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

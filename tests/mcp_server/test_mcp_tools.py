@@ -1,7 +1,5 @@
 """The MCP server, called by the client of the package `mcp`: in process, over stdio and over HTTP with tokens."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json

@@ -1,7 +1,5 @@
 """Named areas: polygons with a floor, durable, carried to the next map, and understood in questions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

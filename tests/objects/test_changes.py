@@ -1,7 +1,5 @@
 """What changed between two maps: only what later views see through, or earlier ones saw empty."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from place_scenes import CAMERA, MapCamera

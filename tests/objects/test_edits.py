@@ -1,7 +1,5 @@
 """Edits of objects: durable, attributed, undoable, carried to the next map, and stronger than later detections."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 `pytest -m slow -s tests/objects/test_home_changes.py` prints what was right, in parts, missed, unknown and wrong.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 
@@ -22,6 +20,9 @@ from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.home_settings import HomeSettings
 
 pytest.importorskip("embreex", reason="simulated homes come with the extra sim")
+
+pytestmark = pytest.mark.slow
+
 CHANGED = "stool:-0.5:0.4,blanket:-0.5:0.4,vase:0:0.45"
 
 
@@ -173,7 +174,6 @@ def _score(home: int) -> tuple[Counter[str], list[Change]]:
     return verdicts, [change for change in reported if change not in explained]
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_most_large_changes_of_eight_homes_are_found_and_nothing_else_is_reported() -> None:
     scores = {home: _score(home) for home in HOMES}

@@ -1,7 +1,5 @@
 """Light objects: what a detector sees beside the task's objects is remembered, and changes nothing of the task."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """`gausslite objects`: questions about the folder of a run, as text and JSON, with the orientation of its Gaussians."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Nothing is lost, and nothing that is gone or was deleted comes back.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

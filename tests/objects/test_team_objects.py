@@ -1,7 +1,5 @@
 """Objects of a team: merging landmarks across agents, noun queries, and their persistence."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -115,8 +113,7 @@ def test_an_object_keeps_its_id_when_agents_join_and_leave_and_after_a_restart()
     [other] = MergedObjects(store).of({"ant": report(landmark("mug", (9, 0, 0)))}, {})
     assert other.landmark.object_id == "team/mug-3"
     store.save_record("", "object-ids", b"[1")
-    with pytest.raises(CodecError, match="stored ids of objects"):
-        MergedObjects(store)
+    pytest.raises(CodecError, MergedObjects, store).match("stored ids of objects")
 
 
 def merge_all_pairs(reports: dict[str, ObjectReport]) -> set[frozenset[tuple[str, str]]]:
@@ -222,8 +219,7 @@ def test_a_query_finds_synonyms_and_plurals_and_moves_landmarks_to_the_fused_fra
     assert moved.landmark.centroid_m == pytest.approx((0, 1, 2))
     assert moved.landmark.extent_m.min_m == pytest.approx((-0.05, 0.95, 1.95))
     for noun in ("\n", "x" * 1000, "  "):
-        with pytest.raises(InvalidInputError, match="noun"):
-            find_objects(merge_objects(reports), noun)
+        pytest.raises(InvalidInputError, find_objects, merge_objects(reports), noun).match("noun")
 
 
 def test_a_landmark_that_moves_out_of_range_is_left_out_and_others_are_found() -> None:
@@ -258,8 +254,7 @@ def test_a_report_is_encoded_completely_and_damage_is_one_error() -> None:
     original = report(landmark("mug", (1, 2, 3)))
     assert decode_object_report(encode_object_report(original)) == original
     for damaged in (b"", b"[]", b'{"task_id": 1}', encode_object_report(original).replace(b"target", b"ground")):
-        with pytest.raises(CodecError, match="object report"):
-            decode_object_report(damaged)
+        pytest.raises(CodecError, decode_object_report, damaged).match("object report")
 
 
 def test_values_out_of_range_are_refused() -> None:
@@ -274,9 +269,6 @@ def test_values_out_of_range_are_refused() -> None:
         {"confidence": float("nan")},
         {"first_seen_ns": 100},
     ):
-        with pytest.raises(InvalidInputError, match="object"):
-            replace(good, **wrong)
-    with pytest.raises(InvalidInputError, match="repeated"):
-        report(good, good)
-    with pytest.raises(InvalidInputError, match="at most 200"):
-        report(*(landmark("mug", (0, 0, 0), i) for i in range(201)))
+        pytest.raises(InvalidInputError, replace, good, **wrong).match("object")
+    pytest.raises(InvalidInputError, report, good, good).match("repeated")
+    pytest.raises(InvalidInputError, report, *(landmark("mug", (0, 0, 0), i) for i in range(201))).match("at most 200")

@@ -1,7 +1,5 @@
 """Every kind of damage to a store, a spool or a state is refused, harmless or told; repair leads on from each."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import shutil
@@ -200,8 +198,7 @@ def require_repaired(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What the refusal advises leads to a store that opens without a word; without a file only a backup helps."""
     caplog.clear()
     if not path.exists() or path.stat().st_size == 0:
-        with pytest.raises(StorageError, match=r"restore a backup|got no file"):
-            verify(path, repair=True)
+        pytest.raises(StorageError, verify, path, repair=True).match(r"restore a backup|got no file")
         return
     verify(path, repair=True)
     assert verify(path).damaged_rows == 0

@@ -1,7 +1,5 @@
 """`gausslite evict` and `unban` on a real fusion server."""
 
-from __future__ import annotations
-
 import pytest
 from fusion_running import GRID, RunningServer, make_subset
 
@@ -20,8 +18,7 @@ def test_an_operator_evicts_bans_and_unbans_an_agent(fusion: RunningServer, caps
     assert capsys.readouterr().out == "banned bee: data of 2 voxels deleted\n"
     assert main(["status", fusion.client.address]) == 0
     assert "banned     bee" in capsys.readouterr().out
-    with pytest.raises(NotPermittedError, match="'bee': banned by an operator"):
-        fusion.client.join("bee", GRID)
+    pytest.raises(NotPermittedError, fusion.client.join, "bee", GRID).match("'bee': banned by an operator")
     assert main(["unban", fusion.client.address, "bee"]) == 0
     assert capsys.readouterr().out == "bee may join again\n"
     assert fusion.client.join("bee", GRID).session_id

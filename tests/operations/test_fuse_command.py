@@ -1,7 +1,5 @@
 """`gausslite fuse` keeps its inputs, and fuses only maps of one world frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

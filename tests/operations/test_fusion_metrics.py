@@ -1,7 +1,5 @@
 """The figures that Prometheus reads over HTTP."""
 
-from __future__ import annotations
-
 import json
 import re
 import urllib.request
@@ -78,5 +76,4 @@ def test_wrong_addresses_are_one_line(engine: FusionEngine) -> None:
         metrics_server("9100", lambda: engine, engine.acknowledgements).__enter__()
     with metrics_server("127.0.0.1:0", lambda: engine, engine.acknowledgements) as port:
         second = metrics_server(f"127.0.0.1:{port}", lambda: engine, engine.acknowledgements)
-        with pytest.raises(UnavailableError, match="choose another address"):
-            second.__enter__()
+        pytest.raises(UnavailableError, second.__enter__).match("choose another address")

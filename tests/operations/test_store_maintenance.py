@@ -1,7 +1,5 @@
 """The file of a store: created at once, its log copied; a damaged one is repaired, restored or refused."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import sqlite3
@@ -49,8 +47,7 @@ def test_a_damaged_row_is_refused_with_the_way_out_and_repair_removes_only_it(pa
     incarnation_id = before.incarnation_id
     before.close()
     flip_a_bit(path, "voxel_updates", column, "number = (SELECT max(number) FROM voxel_updates)")
-    with pytest.raises(StorageError, match=r"is damaged.*restore a backup.*--repair"):
-        SqliteStore(path)
+    pytest.raises(StorageError, SqliteStore, path).match(r"is damaged.*restore a backup.*--repair")
     assert verify(path).damaged_rows == 1
     assert verify(path, repair=True).damaged_rows == 1
     assert verify(path).damaged_rows == 0
@@ -87,8 +84,7 @@ def test_a_keyframe_with_parts_that_are_missing_or_not_its_own_is_not_served(pat
         db.executescript(change)
     db.close()
     index = 3 if "frame_index" in change else 2
-    with pytest.raises(StorageError, match=f"keyframe {index} of agent 'ant' is damaged"):
-        store.keyframe("ant", index)
+    pytest.raises(StorageError, store.keyframe, "ant", index).match(f"keyframe {index} of agent 'ant' is damaged")
     store.close()
     assert verify(path, repair=True).damaged_rows == 1
     report = verify(path)
@@ -110,8 +106,7 @@ def test_repair_keeps_the_rows_of_intact_pages_and_the_file_before(tmp_path: Pat
     data[4096 * (page - 1) : 4096 * page] = bytes(4096)
     path.write_bytes(data)
     for read in (SqliteStore, verify):
-        with pytest.raises(StorageError, match=r"--repair"):
-            read(path)
+        pytest.raises(StorageError, read, path).match(r"--repair")
     report = verify(path, repair=True)
     assert (tmp_path / "store.sqlite.replaced-1").read_bytes() == bytes(data)
     assert report.replaced.endswith("store.sqlite.replaced-1")
@@ -127,8 +122,7 @@ def test_a_store_without_its_properties_is_one_clear_line(path: Path, change: st
         db.execute(change)
     db.close()
     for read in (SqliteStore, verify):
-        with pytest.raises(StorageError, match="expected its properties, got damaged ones; restore a backup"):
-            read(path)
+        pytest.raises(StorageError, read, path).match("expected its properties, got damaged ones; restore a backup")
     verify(path, repair=True)
     with closing(SqliteStore(path)) as store:
         assert store.batch("ant").keys.tolist() == list(VOXELS)
@@ -160,8 +154,7 @@ def test_an_emptied_file_is_refused(path: Path, is_database: bool) -> None:
         with contextlib.closing(sqlite3.connect(path)) as db:
             db.execute("PRAGMA journal_mode = WAL")
         assert path.stat().st_size > 0
-    with pytest.raises(StorageError, match="got an empty file; restore a backup"):
-        SqliteStore(path)
+    pytest.raises(StorageError, SqliteStore, path).match("got an empty file; restore a backup")
 
 
 def test_a_torn_log_is_told_and_cut_at_the_last_whole_message_when_it_is_repaired(tmp_path: Path) -> None:
@@ -196,11 +189,9 @@ def test_a_backup_of_a_running_store_is_restored_as_another_incarnation(tmp_path
     store = SqliteStore(path)
     store.put(random_subset("ant", 1, {11: 2}))
     assert back_up(path, backup).voxels == 1
-    with pytest.raises(StorageError, match="the file exists"):
-        back_up(path, backup)
+    pytest.raises(StorageError, back_up, path, backup).match("the file exists")
     store.put(random_subset("ant", 2, {22: 2}))
-    with pytest.raises(StorageError, match="in use by another server"):
-        restore(backup, path)
+    pytest.raises(StorageError, restore, backup, path).match("in use by another server")
     incarnation_id = store.incarnation_id
     store.close()
     report, replaced = restore(backup, path)
@@ -216,8 +207,7 @@ def test_a_damaged_backup_replaces_nothing(path: Path, tmp_path: Path) -> None:
     backup = tmp_path / "backup.sqlite"
     back_up(path, backup)
     flip_a_bit(backup, "voxel_updates", "voxels")
-    with pytest.raises(StorageError, match="1 damaged"):
-        restore(backup, path)
+    pytest.raises(StorageError, restore, backup, path).match("1 damaged")
     assert verify(path).voxels == len(VOXELS)
 
 

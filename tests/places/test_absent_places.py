@@ -1,7 +1,5 @@
 """Without this package `map` works as before, and what needs the package names it in one line."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 
@@ -21,8 +19,8 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_sequence_with_a_drift_is_mapped(tmp_path: Path) -> None:
-    options = ("--frames", "0:3", "--size", "80x60", "--set", "pose-prior=0.006,0.15")
-    done = _run("map", "sim:home?drift=1%", *options, "--out", str(tmp_path / "map"))
+    options = ("--set", "pose-prior=0.006,0.15")
+    done = _run("map", "sim:home?drift=1%&frames=3&size=80x60", *options, "--out", str(tmp_path / "map"))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "map" / "map.ply").exists()
 

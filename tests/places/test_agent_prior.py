@@ -1,7 +1,5 @@
 """An agent localises itself in the map of an earlier run, continues it, and does so again after a restart."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

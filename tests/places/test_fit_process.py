@@ -1,7 +1,5 @@
 """The comparisons' process: the same fits, started again when it is killed, gone with the process that started it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -106,8 +104,7 @@ def test_a_comparison_that_raises_is_one_line_and_the_process_goes_on() -> None:
     [((sys.executable, "-c", "exit(7)"), "ended 2 times, with code"), (("/nowhere/python",), "does not start")],
 )
 def test_a_process_that_never_answers_gives_one_line(command: tuple[str, ...], reason: str) -> None:
-    with pytest.raises(UnavailableError, match=reason):
-        FitProcess(command)(corner(1), corner(0))
+    pytest.raises(UnavailableError, FitProcess(command), corner(1), corner(0)).match(reason)
 
 
 def test_closing_ends_a_comparison_that_hangs_and_refuses_later_ones() -> None:

@@ -1,7 +1,5 @@
 """Frames of a team: a misfit is measured and corrected, a gross one that others repeat is quarantined."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -345,8 +343,7 @@ def test_an_agent_that_cannot_be_compared_stays_due_and_the_others_are_compared(
         return fit_frame(source, target)
 
     engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0), fit=fail_once)
-    with pytest.raises(UnavailableError, match="agent 'ant': killed"):
-        engine.align_due()
+    pytest.raises(UnavailableError, engine.align_due).match("agent 'ant': killed")
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     compared = len(calls)
     assert not engine.align_due().is_due

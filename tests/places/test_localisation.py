@@ -1,7 +1,5 @@
 """A frame is localised in a map of rendered keyframes, and refused in look-alikes and where two places fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

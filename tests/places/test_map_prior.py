@@ -1,7 +1,5 @@
 """`gausslite map --prior` continues a saved map in its frame, or says that it is another place; `diff` compares."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The pose graph: true loops remove the drift, false ones do not count, and a wrong correction is taken back."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -113,5 +111,4 @@ def test_a_restored_graph_continues_with_the_same_bits() -> None:
 def test_a_loop_with_an_unknown_keyframe_is_refused() -> None:
     graph = drifting_graph(circle())
     graph.add_loop(Loop(0, COUNT, np.eye(4)))
-    with pytest.raises(MapFileError, match="loops"):
-        PoseGraph(PoseExposurePrior()).restore(graph.state())
+    pytest.raises(MapFileError, PoseGraph(PoseExposurePrior()).restore, graph.state()).match("loops")

@@ -1,7 +1,5 @@
 """Registration finds a motion with and without a guess, and abstains where surfaces leave an axis free."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from place_scenes import MapCamera, looking, room

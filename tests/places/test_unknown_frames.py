@@ -1,7 +1,5 @@
 """Agents that do not know their frame: they stay apart until the server has found it, and it abstains when unsure."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """A pose is accepted where the map agrees with the image there and nowhere near; look-alike rooms are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pose and exposure fits recover known errors, and the prior limits them."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace
@@ -190,5 +188,4 @@ def test_fitting_a_view_never_lowers_its_psnr(shift_m: float) -> None:
 
 @pytest.mark.parametrize("text", ["", "1", "0.1,0.2,0.3", "a,b", "-1,0", "nan,0", "0.1,inf", "1e300,0", "0,0,0,1e200"])
 def test_an_invalid_prior_is_rejected(text: str) -> None:
-    with pytest.raises(InvalidInputError, match="pose prior"):
-        PoseExposurePrior.parse(text)
+    pytest.raises(InvalidInputError, PoseExposurePrior.parse, text).match("pose prior")

@@ -1,7 +1,5 @@
 """Exports of the ZED SDK and of Record3D: frames with their poses, cameras and depth; one-line errors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -87,8 +85,7 @@ def test_record3d_without_poses_or_times_is_read_for_tracking(tmp_path: Path, fr
         del fields[name]
     (folder / "metadata").write_text(json.dumps(fields))
     (folder / "rgbd" / "0.conf").write_bytes(b"")
-    with pytest.raises(DatasetError, match="poses in metadata"):
-        open_source(str(folder))
+    pytest.raises(DatasetError, open_source, str(folder)).match("poses in metadata")
     source = open_source(str(folder), require_poses=False)
     np.testing.assert_array_equal(source.frame(0).T_world_camera, np.eye(4))
     assert (source.frame(0).depth_m[0] > 0).any()

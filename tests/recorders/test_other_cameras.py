@@ -1,7 +1,5 @@
 """The camera of other tools' files beside the images is used; one that is assumed by the layout is named."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -54,8 +52,7 @@ def test_other_tools_cameras(tmp_path: Path, name: str, text: str, units: float 
 )
 def test_a_damaged_file_is_named(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(DatasetError, match=name):
-        read_folder_camera(tmp_path, 16, 12)
+    pytest.raises(DatasetError, read_folder_camera, tmp_path, 16, 12).match(name)
 
 
 def test_other_texts_are_no_cameras(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Joint refinement of a small scene: convergence, occlusion, limits and cancellation."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -140,8 +138,7 @@ def test_an_empty_or_too_large_map_is_refused() -> None:
     with pytest.raises(QuotaError, match="at most 3 Gaussians, got 16"):
         refine(patch(0.2), [view(1)], ReferenceRasterizer(), RefineSettings(max_gaussians=3))
     for wrong in ({"check_every": 0}, {"max_gaussians": 0}):
-        with pytest.raises(InvalidInputError, match="refine"):
-            RefineSettings(**wrong)
+        pytest.raises(InvalidInputError, RefineSettings, **wrong).match("refine")
 
 
 def encoded(agent_id: str, index: int, data: bytes = b"", time_ns: int | None = None) -> EncodedKeyframe:
@@ -170,8 +167,7 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     assert {name: list(sizes) for name, sizes in store.keyframe_sizes().items()} == {"aardvark": [7]}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
         KeyframePool(store, Quotas(keyframe_pixels=1)).add(encoded("ant", 1))
-    with pytest.raises(InvalidInputError, match="expected at least 1"):
-        Quotas(keyframes_per_agent=0)
+    pytest.raises(InvalidInputError, Quotas, keyframes_per_agent=0).match("expected at least 1")
 
 
 @pytest.mark.parametrize("restarts", [False, True])
@@ -191,8 +187,7 @@ def test_the_newest_keyframe_is_of_the_second_mission_whose_indices_begin_again(
         pool = KeyframePool(store, limits)
     assert pool.indices("ant") == (9, 7, 0, 1)
     assert (pool.find("ant"), pool.find("ant", 7)) == (b"second 1", b"corrected")
-    with pytest.raises(InvalidInputError, match="such as 1, got 5"):
-        pool.find("ant", 5)
+    pytest.raises(InvalidInputError, pool.find, "ant", 5).match("such as 1, got 5")
     pool.add(encoded("ant", 2, b"second 2", time_ns=102))
     assert pool.indices("ant") == (7, 0, 1, 2)
     store.close()
@@ -205,8 +200,7 @@ def test_a_keyframe_stored_without_its_place_is_the_newest_and_a_damaged_order_i
     store.save_keyframe("ant", 2, b"2")
     assert KeyframePool(store, Quotas()).find("ant") == b"2"
     store.save_record("ant", ORDER_RECORD, b"{")
-    with pytest.raises(CodecError, match="stored order of keyframes"):
-        KeyframePool(store, Quotas())
+    pytest.raises(CodecError, KeyframePool, store, Quotas()).match("stored order of keyframes")
 
 
 def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> None:
@@ -229,5 +223,4 @@ def test_keyframes_that_are_not_selected_are_deleted() -> None:
 def test_a_damaged_keyframe_is_named() -> None:
     pool = KeyframePool(SqliteStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24), decode_frame)
     pool.add(encoded("ant", 1, b"\xff\xff"))
-    with pytest.raises(CodecError, match="expected an EncodedFrame"):
-        pool.decode(pool.read(pool.names()))
+    pytest.raises(CodecError, pool.decode, pool.read(pool.names())).match("expected an EncodedFrame")

@@ -1,7 +1,5 @@
 """Keyframes are selected for what they add to the coverage of the region and of the mission."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame

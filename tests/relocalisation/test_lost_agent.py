@@ -1,7 +1,5 @@
 """While a robot's place is not known, its agent sends nothing to the server and says so."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A robot that is lifted, covered or restarted is noticed and found again; one that drives on stays tracked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,7 +13,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.poses import PoseTable
-from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.settings import MapperSettings, OptimizationSettings
 from gausslite.mission.localisation_monitor import UNPLACED, LocalisationState
 from gausslite.mission.runner import MissionTotals
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
@@ -31,7 +29,7 @@ HERE = [looking(0.8 + 0.04 * step, 0.8, 30.0 + 2.0 * step) for step in range(8)]
 UNSEEN = [looking(3.2 - 0.03 * step, 2.2, 200.0 + 2.0 * step) for step in range(5)]
 """It looks at the wall that the tour has at its back."""
 T_OTHER = transform_of(np.array([5.0, -2.0, 0.3, 0.0, 0.0, 2.0]))
-SETTINGS = MapperSettings(max_gaussians=20_000)
+SETTINGS = MapperSettings(max_gaussians=20_000, optimization=OptimizationSettings(1, 2))
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +180,10 @@ HOMES = {
 }
 
 
-@pytest.mark.parametrize("address", HOMES.values(), ids=HOMES)
+@pytest.mark.parametrize(
+    "address",
+    [pytest.param(address, id=name, marks=[pytest.mark.slow] * ("blur" in address)) for name, address in HOMES.items()],
+)
 def test_a_mission_without_an_event_is_mapped_as_if_nobody_watched(address: str) -> None:
     home = open_source(address)
     frames = [home.frame(position, (160, 120)) for position in range(0, 40, 2)]

@@ -1,7 +1,5 @@
 """Packed splat files: what their layouts mean, rows that are no Gaussians, and files that are damaged on purpose."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """`gausslite render`: files of poses, images, depth, alpha and video, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Colours that depend on the view: the basis against gsplat's, turns, blocks that are left out, and files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock, patch

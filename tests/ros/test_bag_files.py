@@ -1,7 +1,5 @@
 """Recordings as they reach a user: in parts, of other writers, cut short, moved, or of a recorder that was killed."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import struct
@@ -268,8 +266,7 @@ def test_a_missing_part_is_named(tmp_path: Path) -> None:
     content = yaml.safe_load(metadata.read_text())
     content["rosbag2_bagfile_information"]["relative_file_paths"].append("a_1.db3")
     metadata.write_text(yaml.safe_dump(content))
-    with pytest.raises(DatasetError, match=r"metadata.yaml names a_1.db3, which is not there"):
-        frames_of(folder)
+    pytest.raises(DatasetError, frames_of, folder).match(r"metadata.yaml names a_1.db3, which is not there")
 
 
 def test_topics_of_all_parts_are_listed(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Messages of a bag, fed one by one as they would arrive, become the frames that the bag's source has."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from itertools import pairwise

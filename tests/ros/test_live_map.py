@@ -1,7 +1,5 @@
 """Planar grids while a map grows: seen floor and air are free, obstacles of a height are occupied, the rest unknown."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import plain_gaussians
 

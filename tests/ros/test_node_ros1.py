@@ -1,7 +1,5 @@
 """The node of ROS 1 publishes messages that rospy can send, and reads those of rospy; it needs rospy."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from typing import Any
 

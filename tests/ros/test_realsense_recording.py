@@ -1,7 +1,5 @@
 """A recording of the RealSense SDK: its topics, its depth unit, and depth that is registered to the colour camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import ModuleType
 

@@ -1,7 +1,5 @@
 """The node without rclpy: a bag is replayed to it, a real agent maps the frames, and it publishes valid messages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -270,8 +268,7 @@ def test_the_correction_is_a_transform_from_map_to_odometry() -> None:
     ],
 )
 def test_wrong_parameters_give_one_line(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(InvalidInputError, match=message):
-        NodeParameters.of(values)
+    pytest.raises(InvalidInputError, NodeParameters.of, values).match(message)
 
 
 def test_camera_info_is_looked_for_beside_the_images() -> None:

@@ -1,7 +1,5 @@
 """The colcon package is consistent: entry point, parameters file, dependencies, and ROS only in the nodes."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

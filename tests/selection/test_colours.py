@@ -1,7 +1,5 @@
 """Colour words against pixels, simulated objects and a task with two objects of one noun."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Regions that a person points at: their overlap with ground truth, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -20,7 +18,7 @@ from gausslite_selection.pointing import mask_on_image, region_at, region_on_ima
 @pytest.fixture(scope="module")
 def home() -> tuple[list[Frame], Region]:
     """Frames of a simulated home, and the mug's exact region."""
-    source = open_source("sim:home")
+    source = open_source("sim:home?size=160x120")
     return [source.frame(i) for i in range(0, len(source), 12)], source.regions()["mug"]
 
 

@@ -1,7 +1,5 @@
 """Questions about a finished map: nouns, relations, superlatives and counts, with the graph of a task."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Relations between objects, on a table of 1.2 m that a camera observes from 3 m, and superlatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

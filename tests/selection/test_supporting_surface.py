@@ -1,7 +1,5 @@
 """Objects on surfaces that the detector cannot find: heights above the floor decide, in scenes of exact boxes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """deploy/: pinned images that no public registry answers, programs with options that exist, pods that are closed."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Write simulated_home.json, the recorded images of test_golden_home.py. Run this after an intended change."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

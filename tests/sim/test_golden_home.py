@@ -1,7 +1,5 @@
 """The simulated home does not change: results measured in it must stay comparable."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

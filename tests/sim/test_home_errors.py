@@ -1,7 +1,5 @@
 """Names of simulated homes that are refused in one line."""
 
-from __future__ import annotations
-
 import re
 import sys
 
@@ -34,8 +32,7 @@ UNKNOWN = "expected sim:home, or one of sim:home-1 to"
     ],
 )
 def test_a_wrong_home_is_named(name: str, message: str) -> None:
-    with pytest.raises(DatasetError, match=re.escape(message)):
-        open_source(f"sim:{name}")
+    pytest.raises(DatasetError, open_source, f"sim:{name}").match(re.escape(message))
 
 
 def test_a_lens_that_cannot_be_inverted_is_refused() -> None:
@@ -46,5 +43,4 @@ def test_a_lens_that_cannot_be_inverted_is_refused() -> None:
 @pytest.mark.slow
 def test_without_the_ray_caster_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    with pytest.raises(DatasetError, match=r"pip install 'gausslite\[sim\]'"):
-        HomeScene(plan_home(0, seed=5))
+    pytest.raises(DatasetError, HomeScene, plan_home(0, seed=5)).match(r"pip install 'gausslite\[sim\]'")

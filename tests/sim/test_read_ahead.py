@@ -1,7 +1,5 @@
 """Of a sequence that is read in order, the next item is computed while the reader works on the last one."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest
@@ -64,6 +62,5 @@ def test_the_next_item_is_computed_without_a_request() -> None:
 def test_an_error_comes_with_its_own_item() -> None:
     items = ReadAhead(Recorder(), COUNT)
     assert [items(i) for i in (3, 4)] == [9, 16]
-    with pytest.raises(ValueError, match="item 5"):
-        items(5)
+    pytest.raises(ValueError, items, 5).match("item 5")
     assert items(6) == 36

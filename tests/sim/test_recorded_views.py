@@ -1,7 +1,5 @@
 """Rolling shutter, motion blur and lens of a simulated camera are exact: each row, sample and ray has its own pose."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

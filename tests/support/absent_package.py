@@ -1,7 +1,5 @@
 """Let a package beside the core be absent for a test."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

@@ -1,7 +1,5 @@
 """An agent and its service in this process or another, and an estimator that tests can block and break."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A headless Chromium of the system with software rendering; tests that need it skip without one."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

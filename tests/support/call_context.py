@@ -1,7 +1,5 @@
 """A call's context, as far as it states the caller."""
 
-from __future__ import annotations
-
 
 class Context:
     """The two methods of a call's context that state its caller, with values as gRPC gives them."""

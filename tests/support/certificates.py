@@ -1,7 +1,5 @@
 """Certificates for tests, made by the script in deploy."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

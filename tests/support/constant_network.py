@@ -1,7 +1,5 @@
 """Write a network whose outputs are the same for every image, in the layout of any exporter."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rows and views for the tests of the native backend."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gausslite.domain.camera import Camera

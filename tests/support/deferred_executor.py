@@ -1,7 +1,5 @@
 """An executor that runs submitted jobs on demand."""
 
-from __future__ import annotations
-
 from concurrent.futures import Executor, Future
 
 

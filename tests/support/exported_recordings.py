@@ -1,7 +1,5 @@
 """Write frames of a simulated home as the ZED SDK's and Record3D's exports, for the tests of their readers."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Sequence

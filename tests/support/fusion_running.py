@@ -1,7 +1,5 @@
 """Agents, voxel updates and a fusion server in process, for the tests of the service."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import subprocess

@@ -3,8 +3,6 @@
 `python tests/support/guide_blocks.py PAGE` runs a page's blocks in the current folder. It needs no test packages.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import socket

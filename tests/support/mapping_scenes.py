@@ -1,7 +1,5 @@
 """Small frames for the mapper's tests: a textured wall seen from a metre or two, with a region in the middle."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gausslite.domain.camera import Camera

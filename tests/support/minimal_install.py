@@ -1,9 +1,8 @@
 """Import all modules, and run commands and programs, in a process that sees no optional package; print JSON.
 
-Arguments: a folder for results, and the import names of the packages of the extra `sim`, which the runs may use.
+Arguments: a folder for results, the import names of the packages of the extra `sim`, which the runs may use, and
+"all" to run more than what is quick.
 """
-
-from __future__ import annotations
 
 import contextlib
 import importlib
@@ -19,7 +18,7 @@ import sitecustomize
 
 PROGRAMS = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
 TASK = "Pick up the mug on the table"
-SOURCE, FRAMES = "sim:home", ("--frames", "0:3", "--size", "160x120")
+SOURCE, FRAMES = "sim:home?size=160x120", ("--frames", "0:3")
 
 
 def failed_imports() -> dict[str, str]:
@@ -60,26 +59,28 @@ def _main(program: str) -> Callable[[list[str]], object]:
     return importlib.import_module(f"{program}.program").run  # type: ignore[no-any-return]
 
 
-def default_paths(out: Path) -> list[dict[str, object]]:
+def default_paths(out: Path, runs_all: bool) -> list[dict[str, object]]:
     """Run what README and the help promise without any extra but `sim`."""
     run_folder, map_file = str(out / "map"), str(out / "map" / "map.ply")
     few = ("--set", "frames=0:6:3", "--set", "refine-iterations=5")
-    commands = (
+    quick = (
         ("map", SOURCE, "--task", TASK, *FRAMES, "--out", run_folder),
+        ("parse", TASK),
+        ("models", "list"),
+        *((command, "--help") for command in importlib.import_module("gausslite.cli.main").commands()),
+    )
+    others = (
         ("map", SOURCE, *FRAMES, "--out", str(out / "uniform")),
         ("eval", map_file, SOURCE, *FRAMES),
         ("fuse", map_file, str(out / "uniform" / "map.ply"), "--out", str(out / "fused.ply")),
-        ("parse", TASK),
         ("report", run_folder),
         ("objects", run_folder),
         ("export", run_folder, "--to", "ply"),
         ("calibrate", "sim:home?frames=12&size=160x120&drift=2%"),
-        ("models", "list"),
         ("doctor", "--json"),
         ("demo", *few, "--size", "160x120", "--out", str(out / "demo")),
-        *((command, "--help") for command in importlib.import_module("gausslite.cli.main").commands()),
     )
-    results = [run("gausslite", arguments) for arguments in commands]
+    results = [run("gausslite", arguments) for arguments in (*quick, *(others if runs_all else ()))]
     return results + [run(program, ("--help",)) for program in PROGRAMS]
 
 
@@ -103,11 +104,11 @@ def missing_extras(out: Path) -> list[dict[str, object]]:
 
 def main() -> None:
     """Print what fails to import, and the results of all runs."""
-    out, sim = Path(sys.argv[1]), sys.argv[2].split(",")
+    out, sim, runs_all = Path(sys.argv[1]), sys.argv[2].split(","), sys.argv[3:] == ["all"]
     imports = failed_imports()
     without_sim = {"extra": "sim", **run("gausslite", ("map", SOURCE, "--task", TASK, "--out", str(out / "no")))}
     sitecustomize.show_packages(sim)
-    results = default_paths(out)
+    results = default_paths(out, runs_all)
     missing = [without_sim, *missing_extras(out)]
     print(json.dumps({"imports": imports, "default_paths": results, "missing_extras": missing}))
 

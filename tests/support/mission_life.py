@@ -5,8 +5,6 @@
 The client uses no code of the project (`proto_client`). It reads a folder in 7-Scenes layout as plain files.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

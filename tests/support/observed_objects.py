@@ -1,7 +1,5 @@
 """The objects of a task from given observations, without frames and a detector."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

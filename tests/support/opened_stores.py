@@ -1,7 +1,5 @@
 """Stores of each kind, which a test opens again after it closed them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Run Python in another process, with packages that it also finds, or does not see."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a person sees and does on a page, without a browser: its contents, its controls, texts, images and plots."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

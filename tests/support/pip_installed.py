@@ -1,7 +1,5 @@
 """Install the example packages from their folders, without network, for a process that the test starts."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

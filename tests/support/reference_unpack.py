@@ -1,7 +1,5 @@
 """The body of a quantised message unpacked column by column with NumPy: the oracle of the native code."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Arguments: the working folder, the commands that must work, and those that must be refused, both as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

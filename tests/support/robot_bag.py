@@ -1,7 +1,5 @@
 """Bags of a robot whose depth camera stands beside the colour camera, and their messages in the order of arrival."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import cycle, islice
 from pathlib import Path

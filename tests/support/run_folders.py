@@ -1,7 +1,5 @@
 """Results folders of runs, written with the program's own writers, for the tests of reports."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

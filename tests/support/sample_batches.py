@@ -1,7 +1,5 @@
 """Random voxel updates for the tests of messages and stores."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import uniform_gaussians
 

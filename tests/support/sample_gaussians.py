@@ -1,7 +1,5 @@
 """Gaussians for tests: plain ones at given positions, or random values in every column."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Run a server in this process, on an event loop in a thread; its messages pass a unix socket as real bytes."""
 
-from __future__ import annotations
-
 import asyncio
 import tempfile
 import threading

@@ -1,7 +1,5 @@
 """Servers in this process that share a mission in one PostgreSQL database."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Signals that a test can send only where the run of the tests itself does not ignore them."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest

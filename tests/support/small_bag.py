@@ -1,7 +1,5 @@
 """Bags of a few small images whose topics, frames and encodings a test may change."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path

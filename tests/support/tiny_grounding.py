@@ -5,8 +5,6 @@ the attention mask are at -inf, as in the real network. The blue channel's mean 
 every logit, so the result also depends on the image and the pixel mask.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

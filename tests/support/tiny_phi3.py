@@ -1,7 +1,5 @@
 """Build a tiny random Phi-3 for onnxruntime-genai: `python tests/support/tiny_phi3.py FOLDER` writes FOLDER/onnx."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

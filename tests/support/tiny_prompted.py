@@ -1,7 +1,5 @@
 """Minimal networks with text features as an input, a CLIP-like text encoder and its tokenizer, with known results."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Write sequences of a few tiny frames in each layout, for the tests of the readers."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Prototype 0 is the image's red channel, averaged over 4x4 pixels; prototype 1 is
 coefficients (20, -10) therefore has its mask where red is above one half. The boxes are constants.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

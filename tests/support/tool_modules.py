@@ -1,13 +1,13 @@
 """Load the scripts of tools/ as modules."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
 
+@cache
 def load_tool(name: str) -> ModuleType:
     """Return tools/NAME.py as a module."""
     path = Path(__file__).resolve().parents[2] / "tools" / f"{name}.py"

@@ -1,7 +1,5 @@
 """Write frames of a simulated home as a folder in TUM layout, with poses at 100 Hz, for tests of bags and readers."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """An uplink to a real fusion server, or to one with scripted answers."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

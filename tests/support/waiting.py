@@ -1,7 +1,5 @@
 """Wait for a change that another thread makes."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

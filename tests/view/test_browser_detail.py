@@ -1,7 +1,5 @@
 """A browser first gets merged splats, then as many as it draws fast enough."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The camera's image on the page: region, outlines and names of objects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

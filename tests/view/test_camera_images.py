@@ -1,7 +1,5 @@
 """Images on the page follow the time slider."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The camera view as a message: evenly thinned paths, and what a hostile agent may send."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -104,5 +102,4 @@ def broken_pose(message: pb.GetCameraViewResponse) -> None:
 def test_a_hostile_view_is_one_error(spoil: Callable[[pb.GetCameraViewResponse], None]) -> None:
     message = camera_view_to_message(view(3))
     spoil(message)
-    with pytest.raises(InvalidInputError):
-        camera_view_from_message(message)
+    pytest.raises(InvalidInputError, camera_view_from_message, message)

@@ -1,7 +1,5 @@
 """A history keeps evenly spaced states, the first and the newest, whatever the number of states added."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -59,5 +57,4 @@ def test_a_state_of_the_same_time_replaces_and_an_earlier_one_begins_again():
 
 
 def test_a_history_that_keeps_no_state_between_its_ends_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="at least 3, got 2"):
-        EvenHistory(2)
+    pytest.raises(InvalidInputError, EvenHistory, 2).match("at least 3, got 2")

@@ -1,7 +1,5 @@
 """A plot's lines may begin at different times, and a browser that was open before the first point draws them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The most important Gaussians of a map, of the task's region and of the background."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians, random_gaussians

@@ -1,7 +1,5 @@
 """The names of objects do not cover each other where the page's camera starts."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The server of a page writes no line for each connection of a browser."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

@@ -1,7 +1,5 @@
 """Colours, legends, the level of detail and the origin check of the page."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

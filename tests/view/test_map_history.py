@@ -1,7 +1,5 @@
 """The history file: what is written is read, damage and other files are refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from sample_gaussians import random_gaussians
@@ -44,14 +42,11 @@ def test_contradicting_arrays_are_refused(tmp_path, changed):
     write_map_history(tmp_path, [MapSnapshot.of(time_ns, random_gaussians(5)) for time_ns in (1, 2)])
     state = read_state(tmp_path / FILE)
     write_state(tmp_path / FILE, {**state, changed: state[changed][::-1] + 1})
-    with pytest.raises(MapFileError, match="map_history"):
-        read_map_history(tmp_path)
+    pytest.raises(MapFileError, read_map_history, tmp_path).match("map_history")
 
 
 def test_other_files_are_refused(tmp_path):
     (tmp_path / FILE).write_bytes(b"no history")
-    with pytest.raises(MapFileError, match="expected the history of a map"):
-        read_map_history(tmp_path)
+    pytest.raises(MapFileError, read_map_history, tmp_path).match("expected the history of a map")
     write_state(tmp_path / FILE, {"means": np.zeros(3)})
-    with pytest.raises(MapFileError, match="times_ns"):
-        read_map_history(tmp_path)
+    pytest.raises(MapFileError, read_map_history, tmp_path).match("times_ns")

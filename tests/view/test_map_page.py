@@ -1,7 +1,5 @@
 """The page of a results folder: what a browser draws and asks for, the scrub over time, the port, who may connect."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
@@ -184,13 +182,11 @@ def test_share_links_are_disabled(page):
 
 def test_a_port_in_use_is_refused(page):
     port = urlsplit(page.url).port
-    with pytest.raises(InvalidInputError, match=re.escape(f"expected a free port, got {port}")):
-        open_page(port, "second")
+    pytest.raises(InvalidInputError, open_page, port, "second").match(re.escape(f"expected a free port, got {port}"))
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path):
-    with pytest.raises(MapFileError, match="expected a results folder"):
-        read_contents(tmp_path)
+    pytest.raises(MapFileError, read_contents, tmp_path).match("expected a results folder")
 
 
 @pytest.mark.parametrize(

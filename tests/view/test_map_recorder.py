@@ -1,7 +1,5 @@
 """The recorder takes snapshots at most four a second, and leaves out a map that the codec refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What `gausslite map` and `gausslite eval` write for the report."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page of `gausslite map` in a real browser: a person points at an object while the run maps."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
@@ -214,8 +212,7 @@ def test_the_page_is_there_before_the_mission_and_refuses_after_it(capsys: pytes
         with urlopen(url) as answer:
             assert answer.status == 200
         begin(mission())
-    with pytest.raises(URLError):
-        urlopen(url)
+    pytest.raises(URLError, urlopen, url)
 
 
 def test_the_current_task_stands_on_the_page_also_while_the_field_has_another() -> None:

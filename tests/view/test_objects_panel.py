@@ -1,7 +1,5 @@
 """A person corrects objects on the page of a run and of a fusion server: the page and everybody see it."""
 
-from __future__ import annotations
-
 import html
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The smallest upright box around points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The plan: objects are drawn where the map is rendered, up follows the cameras, the ceiling is left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The plots of PSNR get the region's and the image's values; an empty region and an exact rendering add no point."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

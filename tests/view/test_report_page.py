@@ -1,7 +1,5 @@
 """`gausslite report`: the page is valid, self-contained and escaped; runs are side by side; errors are one line."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

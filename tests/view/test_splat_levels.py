@@ -1,7 +1,5 @@
 """A coarse level has few splats and looks like the map."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import plain_gaussians
 

@@ -1,7 +1,5 @@
 """The page's camera starts at the task's region, behind the robot, or beside a map without a trajectory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

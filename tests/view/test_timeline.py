@@ -1,7 +1,5 @@
 """A timeline has a limited number of rows, so that an agent can run for weeks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arguments of wrong types: one error that names the argument, what is right and what was received."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -40,7 +38,7 @@ PROGRAM = """
 import dataclasses, json, sys
 import gausslite as gl
 from gausslite.domain.errors import InvalidInputError
-home = gl.open_sequence("sim:home")
+home = gl.open_sequence("sim:home?size=32x24")
 frame = home.frame(0, (32, 24))
 messages = {}
 for call in json.load(sys.stdin):

@@ -1,7 +1,5 @@
 """A plug-in of others that is broken, or takes a name of the core, gives one line and stops no other command."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path

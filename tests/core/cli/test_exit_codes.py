@@ -1,7 +1,5 @@
 """Exit codes are those of docs/reference/commands.md, and a signal ends every long command with one line."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`gausslite map` without the packages that score a run and show it: the map is complete, one line says what is not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -19,7 +17,7 @@ def without_evaluators_and_pages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def arguments(out: Path) -> list[str]:
-    return ["map", "sim:home", "--frames", "0:2", "--size", "80x60", "--iterations", "2", "--out", str(out)]
+    return ["map", "sim:home?frames=2&size=80x60", "--iterations", "2", "--out", str(out)]
 
 
 def test_the_map_is_written_and_one_line_says_what_is_left_out(

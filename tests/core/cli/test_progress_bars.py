@@ -1,7 +1,5 @@
 """Every progress bar of the programs is made by cli/progress.py, so that all look and behave the same."""
 
-from __future__ import annotations
-
 import io
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A process group owns a child as soon as it exists, and ends all children."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows of a store: every bit comes back, and Gaussians of quantised messages take 21 bytes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -93,8 +91,7 @@ def test_voxels_that_do_not_ascend_are_refused() -> None:
     moved = replace(batch.gaussians, means_m=np.repeat(grid.centres_m(keys), batch.counts, axis=0))
     object.__setattr__(batch, "gaussians", moved)
     unpack_subset(message)
-    with pytest.raises(CodecError, match="ascending"):
-        unpack_subset(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))
+    pytest.raises(CodecError, unpack_subset, encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid)).match("ascending")
 
 
 def test_a_damaged_row_is_named() -> None:
@@ -104,5 +101,4 @@ def test_a_damaged_row_is_named() -> None:
     whole = EncodedVoxels.exact(batch, 1).to_row()
     assert (len(row) - len(whole)) == len(batch.gaussians) * (CODES.itemsize - RECORD.itemsize)
     for damaged in (row[:-1], row + b"0", row[:5], b"", row[:8] + b"\xff\xff\xff\xff" + row[12:], bytes(8) + row[8:]):
-        with pytest.raises(StorageError, match="damaged"):
-            EncodedVoxels.from_row(damaged)
+        pytest.raises(StorageError, EncodedVoxels.from_row, damaged).match("damaged")

@@ -1,7 +1,5 @@
 """PLY maps: round trips, exchange with another tool, world frame names, and errors of damaged files."""
 
-from __future__ import annotations
-
 import resource
 from pathlib import Path
 
@@ -133,8 +131,7 @@ def test_the_error_of_a_damaged_map_names_the_file(tmp_path: Path, spoil: object
 
 
 def test_a_missing_map_is_a_map_file_error(tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match="No such file"):
-        read_ply(tmp_path / "none.ply")
+    pytest.raises(MapFileError, read_ply, tmp_path / "none.ply").match("No such file")
 
 
 @given(st.data())
@@ -157,14 +154,12 @@ def test_a_full_disk_raises_storage_error_and_keeps_the_old_map(tmp_path: Path) 
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
     try:
-        with pytest.raises(StorageError, match="cannot be written"):
-            write_ply(path, random_gaussians(500))
+        pytest.raises(StorageError, write_ply, path, random_gaussians(500)).match("cannot be written")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert_same(read_ply(path), random_gaussians(3))
     assert [file.name for file in tmp_path.iterdir()] == ["map.ply"]
-    with pytest.raises(StorageError, match="cannot be written"):
-        write_ply(tmp_path / "no" / "map.ply", random_gaussians(3))
+    pytest.raises(StorageError, write_ply, tmp_path / "no" / "map.ply", random_gaussians(3)).match("cannot be written")
 
 
 @pytest.mark.parametrize("name", ["map", "Küche 2", "日本", "50% %41 \\", "end_header", "world frame"])
@@ -181,8 +176,7 @@ def test_the_world_frame_is_read_back_and_changes_nothing_else(name: str, tmp_pa
 
 @pytest.mark.parametrize("name", ["line\nbreak", "carriage\rreturn", "tab\t", "nul\0", "\u2028", "x" * 256, "\ud800"])
 def test_a_world_frame_with_control_characters_or_too_long_is_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="world frame"):
-        write_ply(tmp_path / "map.ply", random_gaussians(1), name)
+    pytest.raises(InvalidInputError, write_ply, tmp_path / "map.ply", random_gaussians(1), name).match("world frame")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -190,8 +184,7 @@ def test_a_world_frame_with_control_characters_or_too_long_is_refused(name: str,
 def test_an_ambiguous_or_invalid_world_frame_in_a_file_is_refused(comments: bytes, tmp_path: Path) -> None:
     data = ply_bytes(random_gaussians(1), "NAME").replace(b"NAME", comments)
     (tmp_path / "map.ply").write_bytes(data)
-    with pytest.raises(MapFileError, match=r"map\.ply: expected (one|a) world frame"):
-        read_world_frame(tmp_path / "map.ply")
+    pytest.raises(MapFileError, read_world_frame, tmp_path / "map.ply").match(r"map\.ply: expected (one|a) world frame")
 
 
 def test_a_world_frame_in_utf_8_of_an_earlier_file_is_read() -> None:
@@ -234,8 +227,7 @@ def test_every_format_of_ply_is_read_also_after_another_element(file_format: str
 def test_rows_of_another_length_in_ascii_are_refused() -> None:
     data = other_tools_file(other_tools_rows(), "ascii")
     for spoiled in (data[:-40], data.rstrip() + b" 7\n", data[:-8] + b"x" + data[-7:]):
-        with pytest.raises(MapFileError, match=r"expected (9 )?rows of"):
-            gaussians_from_ply(spoiled)
+        pytest.raises(MapFileError, gaussians_from_ply, spoiled).match(r"expected (9 )?rows of")
 
 
 @pytest.mark.parametrize("file_format", ["binary_little_endian", "ascii"])
@@ -263,5 +255,4 @@ def test_a_row_that_is_no_gaussian_is_left_out_with_one_line(tmp_path: Path, col
     ]
     with pytest.warns(UserWarning, match="left out 1 of 9"):
         read_ply(tmp_path / "map.ply")
-    with pytest.raises(MapFileError, match=f"column {column}"):
-        gaussians_from_ply(other_tools_file(rows))
+    pytest.raises(MapFileError, gaussians_from_ply, other_tools_file(rows)).match(f"column {column}")

@@ -1,7 +1,5 @@
 """Images are written as PNG files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -20,5 +18,4 @@ def test_a_png_holds_the_same_colours(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match=r"sheet\.png"):
-        write_png(tmp_path / "missing" / "sheet.png", RGB)
+    pytest.raises(StorageError, write_png, tmp_path / "missing" / "sheet.png", RGB).match(r"sheet\.png")

@@ -1,7 +1,5 @@
 """State files: read back bit for bit, and refused if damaged or forged."""
 
-from __future__ import annotations
-
 import json
 import signal
 import struct
@@ -48,22 +46,19 @@ def forged(header: dict[str, object] | bytes, data: bytes) -> bytes:
 def test_a_forged_header_is_refused(header: dict[str, object] | bytes, data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "forged.state"
     path.write_bytes(forged(header, data))
-    with pytest.raises(MapFileError, match=r"forged\.state: expected"):
-        read_state(path)
+    pytest.raises(MapFileError, read_state, path).match(r"forged\.state: expected")
 
 
 def test_a_header_longer_than_the_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "forged.state"
     path.write_bytes(struct.pack("<Q", 1 << 40) + b"{}")
-    with pytest.raises(MapFileError, match="another kind of file, or part of one"):
-        read_state(path)
+    pytest.raises(MapFileError, read_state, path).match("another kind of file, or part of one")
 
 
 def test_booleans_other_than_0_and_1_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.state"
     write_state(path, {"flags": np.array([7], np.uint8).view(np.bool_)})
-    with pytest.raises(MapFileError, match=r"run\.state: expected .* array flags has invalid booleans"):
-        read_state(path)
+    pytest.raises(MapFileError, read_state, path).match(r"run\.state: expected .* array flags has invalid booleans")
 
 
 def test_arrays_of_every_shape_are_read_back_unchanged(tmp_path: Path) -> None:
@@ -88,21 +83,17 @@ def test_a_truncated_or_changed_file_is_refused(tmp_path: Path) -> None:
     data = path.read_bytes()
     for place in range(len(data)):
         damaged.write_bytes(data[:place])
-        with pytest.raises(MapFileError):
-            read_state(damaged)
+        pytest.raises(MapFileError, read_state, damaged)
         damaged.write_bytes(data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1 :])
-        with pytest.raises(MapFileError):
-            read_state(damaged)
+        pytest.raises(MapFileError, read_state, damaged)
     damaged.write_bytes(data + b"more")
-    with pytest.raises(MapFileError, match="undamaged saved run"):
-        read_state(damaged)
+    pytest.raises(MapFileError, read_state, damaged).match("undamaged saved run")
 
 
 def test_a_state_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be written"):
         write_state(tmp_path / "missing" / "run.state", {"a": np.zeros(3)})
-    with pytest.raises(StorageError, match="expected a regular file"):
-        write_state(Path("/dev/null"), {"a": np.zeros(3)})
+    pytest.raises(StorageError, write_state, Path("/dev/null"), {"a": np.zeros(3)}).match("expected a regular file")
     path = tmp_path / "run.state"
     write_state(path, {"a": np.zeros(3)})
     assert path.stat().st_mode & 0o777 == 0o644

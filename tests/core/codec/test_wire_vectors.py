@@ -1,7 +1,5 @@
 """The test vectors of docs/reference/wire.md: the format does not change without a new version."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

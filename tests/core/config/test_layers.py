@@ -1,7 +1,5 @@
 """Flags override variables, those override the file; wrong values end in one line that says what would be right."""
 
-from __future__ import annotations
-
 import tomllib
 from argparse import Namespace
 from collections.abc import Mapping
@@ -177,8 +175,7 @@ def test_a_wrong_flag_is_one_line_that_names_its_successor(
 
 
 def test_missing_options_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        parse()
+    pytest.raises(SystemExit, parse)
     assert capsys.readouterr().err.startswith("mapper: the following arguments are required: SOURCE, --out; see")
 
 

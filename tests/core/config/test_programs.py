@@ -1,7 +1,5 @@
 """Properties of every option of every program: key, variable, flag, printed configuration and help agree."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from argparse import Namespace

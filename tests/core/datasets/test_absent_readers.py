@@ -1,7 +1,5 @@
 """Recordings open, and are used as they are, without the packages that read and calibrate other ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +30,7 @@ def test_folders_open_without_the_packages_of_other_readers(tmp_path: Path, monk
         remove_package(monkeypatch, package)
     assert open_source(str(tum)).name == "fr1"
     assert open_source(str(inside.parent)).name == "fr1_seq"
-    with pytest.raises(DatasetError, match="sevenscenes: needs the package gausslite_recorders"):
-        open_source(str(seven))
+    pytest.raises(DatasetError, open_source, str(seven)).match("sevenscenes: needs the package gausslite_recorders")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Corrections are texts, and camera files of other programs state lenses."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -29,8 +27,7 @@ def test_the_identity_is_recognised_and_text_round_trips() -> None:
     "text", ["", "readout", "readout=x", "readout=0.5", "offset=2", "speed=1", "readout=0;readout=0", "exposure=-1"]
 )
 def test_a_wrong_correction_is_rejected(text: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"camera|lens"):
-        CameraCorrection.parse(text)
+    pytest.raises(InvalidInputError, CameraCorrection.parse, text).match(r"camera|lens")
 
 
 def test_camera_files_of_other_programs_state_camera_and_lens(tmp_path: Path) -> None:
@@ -64,8 +61,7 @@ def test_camera_files_of_other_programs_state_camera_and_lens(tmp_path: Path) ->
 )
 def test_a_wrong_camera_file_is_rejected_by_name(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(DatasetError, match=name):
-        read_folder_camera(tmp_path, 640, 480)
+    pytest.raises(DatasetError, read_folder_camera, tmp_path, 640, 480).match(name)
 
 
 LENSES = {

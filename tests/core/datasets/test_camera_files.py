@@ -1,7 +1,5 @@
 """Which camera file a recording uses, and which lens the name and the coefficients of a model mean."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -140,8 +138,7 @@ def test_the_published_camera_is_for_its_series_and_aspect_ratio(tmp_path: Path,
     folder = write_tum(tmp_path / name)
     for image in (folder / "rgb").iterdir():
         write_colour(image, width)
-    with pytest.raises(DatasetError, match=f"{name}: the camera is unknown"):
-        open_source(str(folder))
+    pytest.raises(DatasetError, open_source, str(folder)).match(f"{name}: the camera is unknown")
 
 
 def test_several_colmap_cameras_are_no_choice(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Damaged sequences raise one line that names the file and the expected content."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import zipfile
@@ -168,25 +166,19 @@ def test_damage_is_named(
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("name", "make", "message"),
     [
-        (lambda path: None, "got nothing there"),
-        (lambda path: path.write_text("x"), "got a file"),
-        (lambda path: path.write_text(""), "got an empty file"),
-        (lambda path: path.mkdir(), "got an empty folder"),
-        (lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
+        ("place", lambda path: None, "got nothing there"),
+        ("place", lambda path: path.write_text("x"), "got a file"),
+        ("place", lambda path: path.write_text(""), "got an empty file"),
+        ("place", lambda path: path.mkdir(), "got an empty folder"),
+        ("place", lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
+        ("desk.tar.gz", lambda path: path.write_bytes(gzip.compress(b"")), "got a gzip archive; unpack it first"),
     ],
 )
-def test_a_place_without_a_sequence_is_named(tmp_path: Path, make: Damage, message: str) -> None:
-    make(tmp_path / "place")
-    with pytest.raises(DatasetError, match=f"place: .*{message}"):
-        open_source(str(tmp_path / "place"))
-
-
-def test_a_compressed_recording_is_named(tmp_path: Path) -> None:
-    (tmp_path / "desk.tar.gz").write_bytes(gzip.compress(b""))
-    with pytest.raises(DatasetError, match=r"desk.tar.gz: .* got a gzip archive; unpack it first"):
-        open_source(str(tmp_path / "desk.tar.gz"))
+def test_a_place_without_a_sequence_is_named(tmp_path: Path, name: str, make: Damage, message: str) -> None:
+    make(tmp_path / name)
+    pytest.raises(DatasetError, open_source, str(tmp_path / name)).match(f"{name}: .*{message}")
 
 
 def test_a_depth_image_without_returns_is_no_error(tmp_path: Path) -> None:
@@ -270,8 +262,7 @@ def test_text_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
 
 def test_a_position_outside_the_sequence_is_refused(tmp_path: Path) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
-    with pytest.raises(DatasetError, match="position from 0 to 2, got 3"):
-        source.frame(3)
+    pytest.raises(DatasetError, source.frame, 3).match("position from 0 to 2, got 3")
 
 
 def test_regions_are_read_by_name(tmp_path: Path) -> None:
@@ -300,18 +291,15 @@ def test_regions_are_read_by_name(tmp_path: Path) -> None:
 def test_wrong_regions_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], message: str) -> None:
     path = tmp_path / "regions.npz"
     np.savez(path, **arrays)
-    with pytest.raises(DatasetError, match=f"regions.npz: .*{message}"):
-        load_voxel_regions(path)
+    pytest.raises(DatasetError, load_voxel_regions, path).match(f"regions.npz: .*{message}")
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not really", b"\x80\x04N.", b"\x93NUMPY\x01\x00"])
 def test_a_missing_or_damaged_regions_file_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "regions.npz"
-    with pytest.raises(DatasetError, match=r"regions.npz: expected a file of regions"):
-        load_voxel_regions(path)
+    pytest.raises(DatasetError, load_voxel_regions, path).match(r"regions.npz: expected a file of regions")
     path.write_bytes(content)
-    with pytest.raises(DatasetError, match=r"regions.npz: expected a readable"):
-        load_voxel_regions(path)
+    pytest.raises(DatasetError, load_voxel_regions, path).match(r"regions.npz: expected a readable")
 
 
 def test_regions_that_need_too_much_memory_are_refused(tmp_path: Path) -> None:
@@ -320,13 +308,11 @@ def test_regions_that_need_too_much_memory_are_refused(tmp_path: Path) -> None:
     np.lib.format.write_array_header_1_0(declared, {"descr": "<i8", "fortran_order": False, "shape": (10**13, 3)})
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mug.npy", declared.getvalue())
-    with pytest.raises(DatasetError, match=r"regions.npz: expected a readable"):
-        load_voxel_regions(path)
+    pytest.raises(DatasetError, load_voxel_regions, path).match(r"regions.npz: expected a readable")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("mug.npy", "w") as member:
         for _ in range(260):
             member.write(bytes(1 << 20))
-    with pytest.raises(DatasetError, match=r"regions.npz: expected at most"):
-        load_voxel_regions(path)
+    pytest.raises(DatasetError, load_voxel_regions, path).match(r"regions.npz: expected at most")
 
 
 def test_names_without_regions_are_answered_with_another_way() -> None:

@@ -1,7 +1,5 @@
 """Frames without a depth reading are neither mapped nor scored, and the summary reports them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

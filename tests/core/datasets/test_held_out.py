@@ -1,7 +1,5 @@
 """Every frame of a sequence is either a training or a test frame."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,5 +26,4 @@ def test_a_split_is_a_partition_in_order(n: int, every: int) -> None:
 
 @pytest.mark.parametrize("every", [1, 0, -8])
 def test_an_invalid_interval_is_rejected(every: int) -> None:
-    with pytest.raises(InvalidInputError, match="test every"):
-        HeldOutSplit(every)
+    pytest.raises(InvalidInputError, HeldOutSplit, every).match("test every")

@@ -1,7 +1,5 @@
 """Images as devices write them: turned by EXIF, with bytes after their end, or cut; the stored pixels are used."""
 
-from __future__ import annotations
-
 import zlib
 
 import cv2

@@ -1,7 +1,5 @@
 """Pose files in TUM's format: what is written is read, and damaged rows are named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +32,7 @@ def test_poses_are_read_as_written(tmp_path: Path, turn_rad: float) -> None:
 def test_a_damaged_row_is_named(tmp_path: Path, row: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(f"# comment\n{row}\n")
-    with pytest.raises(GaussLiteError, match=r"poses\.txt"):
-        read_pose_rows(path)
+    pytest.raises(GaussLiteError, read_pose_rows, path).match(r"poses\.txt")
 
 
 @pytest.mark.parametrize(

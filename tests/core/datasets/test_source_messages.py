@@ -1,7 +1,5 @@
 """Opening a sequence reports excluded frames, unregistered depth and estimates."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -60,8 +58,7 @@ def test_a_camera_file_states_that_depth_is_registered(tmp_path: Path, capsys: p
     assert (calibration.registration, calibration.source.depth_registered) == (None, True)
     assert capsys.readouterr().err == ""
     (seven / "cam_params.json").write_text(json.dumps({"camera": {**camera, "depth_registered": "yes"}}))
-    with pytest.raises(DatasetError, match="depth_registered: expected true or false, got 'yes'"):
-        open_source(str(seven))
+    pytest.raises(DatasetError, open_source, str(seven)).match("depth_registered: expected true or false, got 'yes'")
 
 
 def test_an_estimated_pose_prior_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

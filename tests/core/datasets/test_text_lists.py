@@ -1,7 +1,5 @@
 """Text lists as other systems and spreadsheets write them: encodings, separators, quotes, headers, empty rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

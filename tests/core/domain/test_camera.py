@@ -1,7 +1,5 @@
 """Lifting and projecting are inverse, for single pixels and whole images."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

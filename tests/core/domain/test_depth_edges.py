@@ -1,7 +1,5 @@
 """Depth is left out beside jumps only."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

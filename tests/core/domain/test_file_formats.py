@@ -1,7 +1,5 @@
 """Files that are something else than their name says are named by their first bytes."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import tarfile
@@ -47,5 +45,4 @@ def test_a_foreign_file_is_named(tmp_path: Path, name: str, content: bytes, foun
 def test_a_folder_of_pointers_is_named(tmp_path: Path) -> None:
     for name in ("metadata.yaml", "run_0.db3"):
         (tmp_path / name).write_bytes(POINTER)
-    with pytest.raises(gl.GaussLiteError, match=r"got a Git LFS pointer .*run_0.db3"):
-        gl.open_sequence(str(tmp_path))
+    pytest.raises(gl.GaussLiteError, gl.open_sequence, str(tmp_path)).match(r"got a Git LFS pointer .*run_0.db3")

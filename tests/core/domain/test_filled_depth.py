@@ -1,7 +1,5 @@
 """Depth at pixels without a measurement: the farthest that is measured near them."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

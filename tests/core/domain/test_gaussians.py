@@ -1,7 +1,5 @@
 """Rows of Gaussians are chosen by indices or booleans of any sequence; others are refused in words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lens distortion equals OpenCV's, and its text form round-trips."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

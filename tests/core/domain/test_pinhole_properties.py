@@ -1,7 +1,5 @@
 """Camera's projections, crops, sizes and matrices agree with each other."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

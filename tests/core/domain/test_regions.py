@@ -1,7 +1,5 @@
 """A region's mask contains exactly the pixels whose surface point is in it, for any camera pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The velocity of a trajectory in the camera's own axes."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Float64

@@ -1,7 +1,5 @@
 """The change log: a watcher that applies the named changes has the fused map."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from few_examples import few_examples
@@ -95,8 +93,7 @@ def test_only_a_change_of_the_fused_map_is_recorded() -> None:
 def test_a_revision_from_before_a_restart_is_gone(revision: int) -> None:
     change_log, store = ChangeLog(first_revision=100), SqliteStore()
     record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3})))
-    with pytest.raises(RevisionGoneError, match="expected 100 to 101"):
-        change_log.voxels.changed_since(revision)
+    pytest.raises(RevisionGoneError, change_log.voxels.changed_since, revision).match("expected 100 to 101")
 
 
 def test_the_number_of_recorded_removals_is_limited() -> None:
@@ -105,8 +102,7 @@ def test_the_number_of_recorded_removals_is_limited() -> None:
     for revision, key in enumerate((1, 2, 3), start=2):
         record(change_log, store, RoiSubset("ant", "", revision, revision, make_batch({key: 0})))
     assert change_log.voxels.revision == 5
-    with pytest.raises(RevisionGoneError):
-        change_log.voxels.changed_since(2)
+    pytest.raises(RevisionGoneError, change_log.voxels.changed_since, 2)
     assert change_log.voxels.changed_since(3).tolist() == [2, 3]
     record(change_log, store, RoiSubset("ant", "", 9, 9, make_batch({3: 1})))
     assert change_log.voxels.changed_since(3).tolist() == [2, 3]

@@ -1,7 +1,5 @@
 """A robot that begins a new map: its former ones stay in the fused map until the new one has outgrown them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -105,10 +103,8 @@ def test_an_earlier_map_is_no_agent_of_its_own() -> None:
     session = reboot(engine)
     send(engine, session, 1, {1: [5]})
     engine.join("bee", ANYTHING)
-    with pytest.raises(InvalidInputError, match="letters, digits"):
-        engine.join(EARLIER, ANYTHING)
-    with pytest.raises(InvalidInputError, match="letters, digits"):
-        engine.evict(EARLIER, ban=True)
+    pytest.raises(InvalidInputError, engine.join, EARLIER, ANYTHING).match("letters, digits")
+    pytest.raises(InvalidInputError, engine.evict, EARLIER, ban=True).match("letters, digits")
 
 
 def test_operators_delete_an_earlier_map_alone_or_with_its_agent() -> None:
@@ -134,8 +130,7 @@ def test_former_maps_are_few_and_leave_in_slices(open_store: OpenStore) -> None:
     engine = engine_on(store)
     for start in range(MAX_FORMER_MAPS + 2):
         send(engine, reboot(engine), 1, {cell: [9] for cell in range(10 * start, 10 * start + start + 1)})
-    with pytest.raises(UnavailableError, match="former maps are being deleted"):
-        reboot(engine)
+    pytest.raises(UnavailableError, reboot, engine).match("former maps are being deleted")
     work(engine)
     strongest = {cell: 9 for start in range(2, 9) for cell in range(10 * start, 10 * start + start + 1)}
     assert strongest.items() <= fused_kappas(engine).items()

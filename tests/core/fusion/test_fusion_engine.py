@@ -1,7 +1,5 @@
 """The fusion engine without a network: figures, mission configuration, quotas and short error messages."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 from typing import Any
@@ -90,8 +88,7 @@ def test_a_store_of_another_mission_is_refused() -> None:
     store = SqliteStore()
     FusionEngine(store, FusionSettings(grid=GRID)).join("ant", MissionConfig("m", "w", 0.10))
     for settings in (FusionSettings(grid=VoxelGrid(0.2)), FusionSettings(grid=GRID, mission_id="other")):
-        with pytest.raises(MismatchError, match=r"got (0\.2 m|'other')"):
-            FusionEngine(store, settings)
+        pytest.raises(MismatchError, FusionEngine, store, settings).match(r"got (0\.2 m|'other')")
 
 
 def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
@@ -108,8 +105,7 @@ def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
         engine.contribute(ant, make_subset("ant", 3, [], removed=(2,)), GRID)
     assert engine.status().agents[0].gaussians == 1
     for wrong in ({"agents": 0}, {"keyframe_pixels": -1}):
-        with pytest.raises(InvalidInputError, match="quota"):
-            Quotas(**wrong)
+        pytest.raises(InvalidInputError, Quotas, **wrong).match("quota")
 
 
 def test_every_error_message_is_one_short_line() -> None:
@@ -131,8 +127,7 @@ def test_every_error_message_is_one_short_line() -> None:
             attempt()
         assert len(str(caught.value)) < 300
         assert "\n" not in str(caught.value)
-    with pytest.raises(SessionUnknownError, match="join again"):
-        engine.members.sessions.get("gone")
+    pytest.raises(SessionUnknownError, engine.members.sessions.get, "gone").match("join again")
 
 
 def test_a_slow_disk_delays_no_question_about_a_session(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """Properties of the fusion: the fused map is a function of the agents' latest voxel updates."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from dataclasses import fields, replace

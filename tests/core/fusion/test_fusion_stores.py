@@ -1,7 +1,5 @@
 """One suite for every store (updates, sessions, mission), then the properties of a durable store."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal
@@ -142,8 +140,7 @@ def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
 
 
 def test_a_message_with_too_large_an_update_seq_is_refused_completely(store: FusionStore) -> None:
-    with pytest.raises(InvalidInputError, match="update_seq"):
-        store.put(random_subset("ant", 2**63, {11: 1}))
+    pytest.raises(InvalidInputError, store.put, random_subset("ant", 2**63, {11: 1})).match("update_seq")
     assert store.agents() == ()
 
 
@@ -230,8 +227,7 @@ def test_a_keyframe_that_was_cut_leaves_the_earlier_one_and_takes_no_space(
         monkeypatch.setattr(
             "gausslite.fusion.store.time", SimpleNamespace(monotonic=time.monotonic, sleep=stop_between)
         )
-        with pytest.raises(type(stop)):
-            store.save_keyframe("ant", 1, bytes(1 << 20))
+        pytest.raises(type(stop), store.save_keyframe, "ant", 1, bytes(1 << 20))
 
     store = open_durable()
     store.save_keyframe("ant", 1, b"small")
@@ -304,24 +300,6 @@ def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     store.close()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [(b"no database at all, only text " * 40, "expected an undamaged GaussLite store"), (None, "another program's")],
-)
-def test_a_foreign_file_is_one_clear_error(tmp_path: Path, content: bytes | None, message: str) -> None:
-    path = tmp_path / "foreign.sqlite"
-    if content is None:
-        with sqlite3.connect(path) as db:
-            db.execute("CREATE TABLE songs (title TEXT)")
-        db.close()
-    else:
-        path.write_bytes(content)
-    with pytest.raises(StorageError, match=message) as caught:
-        SqliteStore(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def _damaged(path: Path) -> None:
     store = SqliteStore(path)
     store.put(random_subset("ant", 1, dict.fromkeys(range(60), 40)))
@@ -331,31 +309,44 @@ def _damaged(path: Path) -> None:
     path.write_bytes(data)
 
 
-def _newer_schema(path: Path) -> None:
-    SqliteStore(path).close()
+def _execute(path: Path, statement: str) -> None:
     with sqlite3.connect(path) as db:
-        db.execute("PRAGMA user_version = 77")
+        db.execute(statement)
     db.close()
 
 
+def _newer_schema(path: Path) -> None:
+    SqliteStore(path).close()
+    _execute(path, "PRAGMA user_version = 77")
+
+
 @pytest.mark.parametrize(
-    ("spoil", "message"), [(_damaged, "undamaged"), (_newer_schema, f"to {SCHEMA_VERSION}, got 77")]
+    ("spoil", "message"),
+    [
+        (
+            lambda path: path.write_bytes(b"no database at all, only text " * 40),
+            "expected an undamaged GaussLite store",
+        ),
+        (lambda path: _execute(path, "CREATE TABLE songs (title TEXT)"), "another program's"),
+        (_damaged, "undamaged"),
+        (_newer_schema, f"to {SCHEMA_VERSION}, got 77"),
+    ],
 )
-def test_a_damaged_or_newer_store_is_one_clear_error(
+def test_a_foreign_damaged_or_newer_file_is_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:
     path = tmp_path / "store.sqlite"
     spoil(path)
     with pytest.raises(StorageError, match=message) as caught:
         SqliteStore(path)
+    assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_an_unwritable_folder_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be opened"):
         SqliteStore(tmp_path / "no" / "such" / "folder" / "store.sqlite")
-    with pytest.raises(StorageError):
-        SqliteStore(tmp_path)
+    pytest.raises(StorageError, SqliteStore, tmp_path)
 
 
 def test_a_second_server_on_the_same_store_is_refused(open_durable: OpenStore) -> None:
@@ -375,12 +366,10 @@ def test_links_do_not_let_a_second_server_open_the_store(tmp_path: Path) -> None
     first = SqliteStore(symbolic)
     first.put(random_subset("ant", 1, {11: 3}))
     for name in (path, symbolic):
-        with pytest.raises(StorageError, match="in use by another server"):
-            SqliteStore(name)
+        pytest.raises(StorageError, SqliteStore, name).match("in use by another server")
     os.link(path, hard)
     for name in (path, symbolic, hard):
-        with pytest.raises(StorageError, match=r"expected a file with one name, got 2 \(hard links\)"):
-            SqliteStore(name)
+        pytest.raises(StorageError, SqliteStore, name).match(r"expected a file with one name, got 2 \(hard links\)")
     hard.unlink()
     first.close()
     second = SqliteStore(path)
@@ -391,8 +380,7 @@ def test_links_do_not_let_a_second_server_open_the_store(tmp_path: Path) -> None
 def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
     store.put(random_subset("ant", 1, {11: 3}))
-    with pytest.raises(StorageError, match="no space left"):
-        store.put(random_subset("ant", 2, {11: 1, 22: 10_000}))
+    pytest.raises(StorageError, store.put, random_subset("ant", 2, {11: 1, 22: 10_000})).match("no space left")
     assert store.batch("ant").counts.tolist() == [3]
     store.put(random_subset("ant", 3, {11: 2}))
     assert store.batch("ant").counts.tolist() == [2]

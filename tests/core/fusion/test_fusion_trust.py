@@ -1,7 +1,5 @@
 """What a hostile or faulty agent can do to a mission: nothing beyond its own name and a plausible kappa."""
 
-from __future__ import annotations
-
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -140,22 +138,19 @@ def test_an_evicted_agent_leaves_no_data_and_a_banned_one_stays_out_after_a_rest
     assert engine.evict("ant", ban=True) == 2
     assert [agent.agent_id for agent in engine.status().agents] == ["bee"]
     assert engine.maps.voted_map().gaussians.kappa.tolist() == [1]
-    with pytest.raises(SessionUnknownError):
-        engine.contribute(ant, make_subset("ant", 2, {0: [9]}), GRID)
+    pytest.raises(SessionUnknownError, engine.contribute, ant, make_subset("ant", 2, {0: [9]}), GRID)
     store.close()
     store = SqliteStore(tmp_path / "store.sqlite")
     engine = new_engine(store)
     assert engine.status().banned_agents == ("ant",)
-    with pytest.raises(NotPermittedError, match="'ant': banned by an operator"):
-        join(engine, "ant")
+    pytest.raises(NotPermittedError, join, engine, "ant").match("'ant': banned by an operator")
     engine.unban("ant")
     assert join(engine, "ant")
     assert engine.evict("ant") == 0
     assert join(engine, "ant")
     with pytest.raises(InvalidInputError, match=r"expected an agent of the mission \(ant, bee\), got 'cat'"):
         engine.evict("cat")
-    with pytest.raises(InvalidInputError, match=r"expected a banned agent \(none is banned\)"):
-        engine.unban("ant")
+    pytest.raises(InvalidInputError, engine.unban, "ant").match(r"expected a banned agent \(none is banned\)")
     assert engine.evict("cat", ban=True) == 0
     assert engine.status().banned_agents == ("cat",)
     store.close()
@@ -194,8 +189,7 @@ def test_what_is_being_written_when_its_agent_is_evicted_is_deleted_too(
     assert store.keyframe_sizes() == {}
     assert not any(store.find_record("ant", record) for record in (RECORD, ORDER_RECORD, TOKEN_RECORD))
     assert engine.status().agents == ()
-    with pytest.raises(SessionUnknownError):
-        write()
+    pytest.raises(SessionUnknownError, write)
 
 
 def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its_lease() -> None:
@@ -208,16 +202,13 @@ def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its
     assert refused.value.retry_after_s == pytest.approx(1)
     assert sessions.get(first).agent_id == "ant"
     clock.now_s += 59
-    with pytest.raises(NameInUseError):
-        sessions.open("ant", "")
+    pytest.raises(NameInUseError, sessions.open, "ant", "")
     # also after a restart of the server, which has no token in clear
     assert b"token" not in b"".join(store.records("join-token").values())
     restarted = SessionRegistry(store, 60.0, clock)
-    with pytest.raises(NameInUseError):
-        restarted.open("ant", "thief")
+    pytest.raises(NameInUseError, restarted.open, "ant", "thief")
     second = restarted.open("ant", "token").session_id
-    with pytest.raises(MismatchError, match="another robot uses this name"):
-        restarted.get(first)
+    pytest.raises(MismatchError, restarted.get, first).match("another robot uses this name")
     clock.now_s += 61
     third = restarted.open("ant", "thief").session_id
     with pytest.raises(NameInUseError) as replaced:
@@ -254,8 +245,7 @@ def test_names_that_never_contributed_do_not_fill_a_mission() -> None:
     assert not any("junk-0" in records for records in all_records(store).values())
     engine.contribute(late, make_subset("late", 1, {1: [1]}), GRID)
     engine.contribute(join(engine, "last"), make_subset("last", 1, {2: [1]}), GRID)
-    with pytest.raises(QuotaError, match="at most 3 in this mission"):
-        join(engine, "later")
+    pytest.raises(QuotaError, join, engine, "later").match("at most 3 in this mission")
 
 
 def test_no_flood_of_names_ends_a_live_lease() -> None:
@@ -264,8 +254,7 @@ def test_no_flood_of_names_ends_a_live_lease() -> None:
     crowded.contribute(join(crowded, "with-data"), make_subset("with-data", 1, {0: [1]}), GRID)
     join(crowded, "junk-0")
     for number in range(1, 9):
-        with pytest.raises(QuotaError, match=r"at most 3 in this mission.*gausslite evict"):
-            join(crowded, f"junk-{number}")
+        pytest.raises(QuotaError, join, crowded, f"junk-{number}").match(r"at most 3 in this mission.*gausslite evict")
     # it can still join again, and contribute
     honest = join(crowded, "honest")
     assert len(crowded.contribute(honest, make_subset("honest", 1, {1: [1]}), GRID).accepted)

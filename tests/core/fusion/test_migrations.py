@@ -1,7 +1,5 @@
 """Stores of earlier schemas, as their releases wrote them (`stores/`), are brought forward when they are opened."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -91,8 +89,7 @@ def test_the_file_before_is_kept_and_a_failed_step_changes_nothing(
 
     with monkeypatch.context() as patched:
         patched.setattr("gausslite_operations.migrations.STEPS", (*STEPS[:-1], fail))
-        with pytest.raises(StorageError, match="no space left"):
-            SqliteStore(path)
+        pytest.raises(StorageError, SqliteStore, path).match("no space left")
     for reader in (verify, lambda own: back_up(own, tmp_path / "copy")):
         with pytest.raises(StorageError, match="of an earlier schema; a server that opens it brings it forward"):
             reader(path)

@@ -1,7 +1,5 @@
 """The voxels of an agent in another frame: what a table of dictionaries says, in a bounded number of bytes."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The packed table: after any changes it has what a dict has, by voxel and by tile."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

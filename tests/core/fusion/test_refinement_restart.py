@@ -1,7 +1,5 @@
 """The refined map survives a restart of the server."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -58,8 +56,7 @@ def test_the_refined_map_is_the_same_after_a_restart_at_every_step(tmp_path: Pat
     ant, bee = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
     engine.contribute(ant, make_subset("ant", 1, {cell: [5] * 3 for cell in range(10)}), GRID)
     engine.contribute(bee, make_subset("bee", 1, {cell: [2] for cell in range(5)}), GRID)
-    with pytest.raises(MismatchError, match="expected a refinement first"):
-        engine.maps.refined_map()
+    pytest.raises(MismatchError, engine.maps.refined_map).match("expected a refinement first")
     engine.keyframes.add(EncodedKeyframe("ant", 1, 1, 1, b"keyframe"))
     revision = engine.maps.revision()
     voted = engine.maps.voted_map().gaussians

@@ -1,7 +1,5 @@
 """The log of rows: whatever is stored, moved, removed and opened again, each voxel has its latest update."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from unittest.mock import Mock
 

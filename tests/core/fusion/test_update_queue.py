@@ -1,7 +1,5 @@
 """Fair queues of updates and group commits: no agent waits for another one's large messages."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np
@@ -120,8 +118,7 @@ def test_messages_wait_encoded_and_their_bytes_are_limited() -> None:
     for number in range(15):
         for _ in range(4):
             queue.add(pending(f"other-{number}", large))
-    with pytest.raises(UnavailableError, match="16 agents have 64 MiB that wait"):
-        queue.add(pending("ant", b"small"))
+    pytest.raises(UnavailableError, queue.add, pending("ant", b"small")).match("16 agents have 64 MiB that wait")
     # a message that is taken is decoded, so it makes room for another one
     [taken] = queue.take(1)
     queue.add(pending("ant", b"small"))

@@ -1,7 +1,5 @@
 """Gaussians follow their keyframes: what moves, what stays, and which voxels are then sent."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

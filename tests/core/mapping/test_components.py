@@ -1,7 +1,5 @@
 """Properties of the mapper for every combination of its components."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth behind a point contradicts it; contradicted Gaussians leave a continued map, as tombstones in the team."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

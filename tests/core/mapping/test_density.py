@@ -1,7 +1,5 @@
 """Clone, split and prune: selection, inheritance and the cap."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Wrong depth beside a depth jump does not reach the training."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

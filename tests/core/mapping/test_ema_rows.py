@@ -1,7 +1,5 @@
 """Exponential moving average (EMA) of the rows, which exported maps contain."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Eviction order when seeds are inserted into a full table, and the cap."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import plain_gaussians
 

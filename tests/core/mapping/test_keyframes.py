@@ -1,7 +1,5 @@
 """Keyframe selection, and the tiles of the task's region."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The mapper as a whole, on a tiny wall, on the native rasterizer."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
@@ -219,8 +217,7 @@ def test_keyframes_are_every_nth_frame_and_the_frames_that_train_the_map() -> No
 def test_policies_by_name() -> None:
     assert policy("task").components == Components()
     assert policy("uniform").components == Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
-    with pytest.raises(InvalidInputError, match="task, paper, uniform"):
-        policy("lavish")
+    pytest.raises(InvalidInputError, policy, "lavish").match("task, paper, uniform")
 
 
 def test_iterations_scale_in_proportion() -> None:

@@ -1,7 +1,5 @@
 """Settings and arguments of the mapping that are refused by name."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -68,5 +66,4 @@ def map_with_another_size() -> object:
     ],
 )
 def test_a_wrong_value_is_named(call: Callable[[], object], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        call()
+    pytest.raises(error, call).match(message)

@@ -1,7 +1,5 @@
 """Things that move: found where earlier frames saw through their place, and left out of the map."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 
@@ -127,5 +125,4 @@ def test_a_simulated_home_has_a_box_that_moves() -> None:
     changed = [empty.frame(i).depth_m != visited.frame(i).depth_m for i in (5, 10, 15)]
     assert sum(map(np.count_nonzero, changed)) > 100
     assert any((a != b).any() for a, b in pairwise(changed))
-    with pytest.raises(DatasetError, match="movers: expected 0 or 1, got 2"):
-        HomeSettings.parse("movers=2")
+    pytest.raises(DatasetError, HomeSettings.parse, "movers=2").match("movers: expected 0 or 1, got 2")

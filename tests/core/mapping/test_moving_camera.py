@@ -1,7 +1,5 @@
 """Frames of a moving camera: seeds at the poses of their rows, training and rendering with motion, and their state."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Named policies keep the cap; baselines follow no task; the paper's policy has the paper's settings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

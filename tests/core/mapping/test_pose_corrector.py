@@ -1,7 +1,5 @@
 """What a corrector returns moves the map, its keyframes and the poses; loops need its package only if they are on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pose history: corrections by time, their mean, a bounded size; anchored poses stay near the odometry's frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -113,8 +111,7 @@ def test_a_forged_state_is_refused(name: str, value: float) -> None:
     record(history, odometry(0), shift(0.1))
     state = {key: array.copy() for key, array in history.state().items()}
     state[name].flat[3] = value
-    with pytest.raises(GaussLiteError, match="state"):
-        PoseTable().restore(state)
+    pytest.raises(GaussLiteError, PoseTable().restore, state).match("state")
 
 
 def test_corrections_between_frames_are_interpolated_and_live_ones_are_the_last() -> None:

@@ -1,7 +1,5 @@
 """Pixel sampling without repeats, weighted and stratified; estimated spacing against a neighbour search."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Iterations that a saturated region does not use train whole images."""
 
-from __future__ import annotations
-
 import math
 from contextlib import AbstractContextManager
 
@@ -84,8 +82,7 @@ def test_a_restored_measurement_continues_alike() -> None:
 def test_a_damaged_state_is_refused() -> None:
     state = dict(visited(0.07).state())
     state["losses"] = -np.asarray(state["losses"])
-    with pytest.raises(MapFileError, match="state saturation"):
-        RegionSaturation(SETTINGS).restore(state)
+    pytest.raises(MapFileError, RegionSaturation(SETTINGS).restore, state).match("state saturation")
 
 
 class CountingScheduler(CountedScheduler):

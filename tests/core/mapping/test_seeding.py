@@ -1,7 +1,5 @@
 """Positions, flags and scales of seeds, with each component on and off."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, rendering_of, wall_frame

@@ -1,7 +1,5 @@
 """Batches of voxels, and the tracker of sent voxels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from sample_gaussians import some_gaussians

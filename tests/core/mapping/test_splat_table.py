@@ -1,7 +1,5 @@
 """Splat table: optimiser state after each operation, and the cap."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from sample_gaussians import some_gaussians
@@ -24,8 +22,7 @@ def test_memory_is_aligned_and_allocated_once() -> None:
 def test_append_beyond_the_cap_is_rejected_without_change() -> None:
     table = SplatTable(10)
     table.append(some_gaussians(8))
-    with pytest.raises(QuotaError, match="at most 2"):
-        table.append(some_gaussians(3))
+    pytest.raises(QuotaError, table.append, some_gaussians(3)).match("at most 2")
     assert table.count == 8
 
 

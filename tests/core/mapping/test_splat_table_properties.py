@@ -1,7 +1,5 @@
 """Splat table under random operations: the cap holds, and columns of different Gaussians are never mixed."""
 
-from __future__ import annotations
-
 import numpy as np
 from few_examples import few_examples
 from hypothesis import given

@@ -1,7 +1,5 @@
 """A task change during a mission: re-evaluation of keyframes, the cap, and voxels that were sent before."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -117,8 +115,7 @@ def test_a_keyframe_whose_reevaluation_fails_costs_one_frame_and_is_skipped() ->
     task_mapper = make_task_mapper()
     map_frames(task_mapper, 0, 4)
     task_mapper.assign(FailingEstimator(2))
-    with pytest.raises(MemoryError, match="temporarily"):
-        task_mapper.process(frame_at(4))
+    pytest.raises(MemoryError, task_mapper.process, frame_at(4)).match("temporarily")
     outcomes = map_frames(task_mapper, 5, 7)
     assert [outcome.reevaluation.keyframes for outcome in outcomes] == [2, 0]
     shown = {keyframe.frame.index: bool(keyframe.relevance.roi.any()) for keyframe in task_mapper.keyframes()}

@@ -1,7 +1,5 @@
 """Voxels of a teammate in the local map: inserted by the vote's rule, with their kappa, and not sent back unchanged."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import plain_gaussians
 

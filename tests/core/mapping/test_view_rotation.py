@@ -1,7 +1,5 @@
 """Views train in turn: new ones first, then those that waited longest; active iterations fill one image's tiles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -54,8 +52,7 @@ def test_a_restored_rotation_continues_alike_and_refuses_a_damaged_state() -> No
     visited(rotation, VIEWS, 3)
     restored.restore(rotation.state())
     assert visited(restored, VIEWS, 9) == visited(rotation, VIEWS, 9)
-    with pytest.raises(MapFileError, match="views"):
-        restored.restore({"views": np.array([7, 7], np.int64)})
+    pytest.raises(MapFileError, restored.restore, {"views": np.array([7, 7], np.int64)}).match("views")
 
 
 class StepRecorder(CpuRasterizer):

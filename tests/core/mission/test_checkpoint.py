@@ -1,7 +1,5 @@
 """A saved run continues with bit-identical results in another process; other files and settings are refused."""
 
-from __future__ import annotations
-
 import json
 import sys
 import zlib
@@ -115,8 +113,7 @@ def test_settings_survive_the_file(saved: Path) -> None:
     assert run.value(MissionSettings, "pose_prior") == SETTINGS[0].pose_prior
     assert run.value(MissionSettings, "disabled") == SETTINGS[0].disabled
     assert run.value(MissionSettings, "poses") is SETTINGS[0].poses
-    with pytest.raises(MapFileError, match=r"MissionSettings\.threads"):
-        run.value(MissionSettings, "threads")
+    pytest.raises(MapFileError, run.value, MissionSettings, "threads").match(r"MissionSettings\.threads")
 
 
 def test_saving_changes_nothing_and_restoring_gives_the_saved_state(tmp_path: Path) -> None:
@@ -167,8 +164,7 @@ def test_a_config_that_is_not_json_objects_is_refused(saved: Path, tmp_path: Pat
     state, damaged = read_state(saved), tmp_path / "run.state"
     for config in ("", "[1]", '{"a": 1}', "[" * 100_000, "\0"):
         write_state(damaged, {**state, "run/config": np.frombuffer(config.encode(), np.uint8)})
-        with pytest.raises(MapFileError, match=r"run\.state: state config: expected settings"):
-            SavedRun.read(damaged)
+        pytest.raises(MapFileError, SavedRun.read, damaged).match(r"run\.state: state config: expected settings")
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Keyframes from before an object was known get its mask when it becomes known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

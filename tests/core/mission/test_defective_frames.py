@@ -1,7 +1,5 @@
 """Frames of one colour, as of a camera that drops out, train nothing and are reported once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An interrupted mapping run keeps its results and can be resumed."""
 
-from __future__ import annotations
-
 import json
 import signal
 from collections.abc import Iterator
@@ -90,8 +88,7 @@ def test_a_second_ctrl_c_interrupts_at_once_unless_a_launcher_repeats_it(monkeyp
         assert type(interrupt.pending_exception) is KeyboardInterrupt
         monkeypatch.setattr("gausslite.process._IMPATIENCE_S", -1.0)
         signal.raise_signal(signal.SIGTERM)
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+        pytest.raises(KeyboardInterrupt, signal.raise_signal, signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
 
 

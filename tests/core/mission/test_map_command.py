@@ -1,7 +1,5 @@
 """`gausslite map`: existing results, corrupt frames and unknown nouns."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a user can get wrong with `gausslite map`: one line that names it, exit code 2, and no map."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`gausslite map`: world frame, negative coordinates, regions of the folder and a corrupt first frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Folders for results: checked before hours of work, by any number of programs at once."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -22,8 +20,7 @@ def test_programs_that_start_together_share_a_new_folder(tmp_path: Path) -> None
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(StorageError, match="file: expected a folder that can be written"):
-        prepare_folder(tmp_path / "file")
+    pytest.raises(StorageError, prepare_folder, tmp_path / "file").match("file: expected a folder that can be written")
 
 
 def test_a_check_leaves_no_folder(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """`gausslite map --resume` continues after the last frame, or names in one line what prevents it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What packages write beside a map: every installed record, and none of an absent package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """TaskMapper: from a frame to the changed voxels of the region."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

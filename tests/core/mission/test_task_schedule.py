@@ -1,7 +1,5 @@
 """The schedule of a mission's tasks, and `map` with a task that changes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

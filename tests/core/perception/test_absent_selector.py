@@ -1,7 +1,5 @@
 """Without a selector, the paper's relations are evaluated; what else a task needs, and pointing, name the package."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from absent_package import remove_package
@@ -82,5 +80,4 @@ def test_pointing_names_the_package_and_no_point_needs_none() -> None:
         lambda: gl.region_on_image(FRAME, [(40, 30)]),
         lambda: pointed_masks([PointedObject(point_m=(0.0, 0.0, 2.0))], [FRAME]),
     ):
-        with pytest.raises(MissingPluginError, match=f"pointing at objects: {NEEDS}"):
-            point()
+        pytest.raises(MissingPluginError, point).match(f"pointing at objects: {NEEDS}")

@@ -1,7 +1,5 @@
 """Asynchronous detection: it never blocks, runs one at a time, and its result refers to its own keyframe."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -108,8 +106,7 @@ def test_a_detector_error_is_raised_at_a_later_frame() -> None:
     estimator = AsyncRelevanceEstimator(TASK, BrokenDetector(), executor)
     estimator.estimate(frame_at(0))
     executor.run_next()
-    with pytest.raises(ModelFileError, match="broken"):
-        estimator.estimate(frame_at(1))
+    pytest.raises(ModelFileError, estimator.estimate, frame_at(1)).match("broken")
 
 
 class BrokenOnce(RegionDetector):
@@ -129,8 +126,7 @@ def test_a_detector_error_on_a_past_frame_is_raised_once_and_retried() -> None:
     estimator = AsyncRelevanceEstimator(TASK, BrokenOnce({"mug": MUG}), executor)
     assert estimator.evaluate_past(earlier) is None
     executor.run_next()
-    with pytest.raises(MemoryError, match="temporarily"):
-        estimator.evaluate_past(earlier)
+    pytest.raises(MemoryError, estimator.evaluate_past, earlier).match("temporarily")
     assert estimator.evaluate_past(earlier) is None
     executor.run_next()
     relevance = estimator.evaluate_past(earlier)

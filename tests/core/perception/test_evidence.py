@@ -1,7 +1,5 @@
 """Evidence for objects: repeated observations, and misses of visible landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -245,5 +243,4 @@ def test_the_best_target_is_reported_first_and_anchors_last():
 
 @pytest.mark.parametrize("settings", [{"min_seen": 0}, {"confident_score": -0.1}, {"min_seen_fraction": 1.1}])
 def test_settings_are_checked(settings):
-    with pytest.raises(InvalidInputError):
-        EvidenceSettings(**settings)
+    pytest.raises(InvalidInputError, EvidenceSettings, **settings)

@@ -1,7 +1,5 @@
 """Masks without what is behind their object, planes that are no solid object, and pixels that locate an object."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """TaskRelevanceEstimator on a synthetic wall: keyframes, propagation, and the relations of Sec. III-B.3."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -219,8 +217,7 @@ def test_region_estimator_assigns_target_indices():
     other = BallRegion((0.5, 0, 2.0), 0.1)
     relevance = RegionRelevanceEstimator([MUG, other]).estimate(frame_at()).relevance
     assert np.array_equal(relevance.target == 1, other.mask(frame_at()))
-    with pytest.raises(InvalidInputError, match="at least one region"):
-        RegionRelevanceEstimator([])
+    pytest.raises(InvalidInputError, RegionRelevanceEstimator, []).match("at least one region")
 
 
 def test_nouns_match_classes_by_name_head_and_synonym():
@@ -292,5 +289,4 @@ def test_only_classes_near_in_meaning_are_offered():
 
 @pytest.mark.parametrize("settings", [{"up_axis": (0.0, 0.0, 0.0)}, {"max_frames": 0}, {"max_rotation_deg": -1.0}])
 def test_settings_are_checked(settings):
-    with pytest.raises(InvalidInputError):
-        RelevanceTrackerSettings(**settings)
+    pytest.raises(InvalidInputError, RelevanceTrackerSettings, **settings)

@@ -1,7 +1,5 @@
 """Surfaces of objects from the votes of masks, and the masks that follow from them along the colour edges."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Messages on stderr are one line without control characters."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

@@ -1,7 +1,5 @@
 """Telemetry of libraries is off at the moment of their import, and the site loads nothing from other servers."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess

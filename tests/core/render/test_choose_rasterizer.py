@@ -1,7 +1,5 @@
 """Backends are created by name, also those of other packages; a missing one gives a one-line error."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bound tables: the kernels store the bounds of rows, without an effect on renderings and training."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which instructions and how many threads the CPU backend uses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

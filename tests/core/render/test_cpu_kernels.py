@@ -1,7 +1,5 @@
 """CPU backend: instruction sets agree, and the number of threads changes no bit."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -3,8 +3,6 @@
 The tests set limits in subprocesses. Sanitizers, which reserve terabytes of addresses, cannot run them.
 """
 
-from __future__ import annotations
-
 import sys
 
 import pytest
@@ -14,7 +12,7 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 resource = pytest.importorskip("resource", reason="this system has no resource limits")
 
 PREPARE = """
-import resource, sys
+import os, resource, sys
 import numpy as np
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import KernelError
@@ -32,7 +30,15 @@ def limit_to(more_bytes):
 SHORT_OF_MEMORY = (
     PREPARE
     + """
-threads, ssim, mebibytes = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
+threads, ssim, limits = int(sys.argv[1]), float(sys.argv[2]), [int(text) for text in sys.argv[3:]]
+# each limit has a process of its own, which begins after the imports
+for mebibytes in limits:
+    child = os.fork()
+    if not child:
+        break
+    assert os.waitpid(child, 0)[1] == 0
+else:
+    sys.exit()
 rng = np.random.default_rng(0)
 rows = np.zeros((60_000, 16), np.float32)
 rows[:, :3] = rng.uniform(-1, 1, (len(rows), 3)) + (0, 0, 3)
@@ -85,9 +91,11 @@ def run(program: str, *arguments: object) -> list[str]:
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
 def test_step_without_memory_changes_nothing_and_the_next_succeeds(threads: int, ssim: float) -> None:
-    outputs = [run(SHORT_OF_MEMORY, threads, ssim, mebibytes) for mebibytes in (2, 8, 12, 16, 24)]
-    assert {tuple(lines) for lines in outputs} <= {("failed True", "usable True"), ("done False", "usable True")}
-    assert ["failed True", "usable True"] in outputs
+    lines = run(SHORT_OF_MEMORY, threads, ssim, 2, 8, 12, 16, 24)
+    outputs = list(zip(lines[::2], lines[1::2], strict=True))
+    assert len(outputs) == 5
+    assert {*outputs} <= {("failed True", "usable True"), ("done False", "usable True")}
+    assert ("failed True", "usable True") in outputs
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="address space limits need Linux")

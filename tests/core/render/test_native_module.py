@@ -1,7 +1,5 @@
 """The built extensions: their type stubs match, and they need only system libraries."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

@@ -1,7 +1,5 @@
 """All variants of the SIMD layer have the same functions, including those not compiled on this machine."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

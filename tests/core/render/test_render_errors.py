@@ -1,7 +1,5 @@
 """Arguments of the rendering that are refused by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -64,11 +62,9 @@ def view_with(weight: float) -> None:
     ],
 )
 def test_a_wrong_value_is_named(call: Callable[[], object], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        call()
+    pytest.raises(error, call).match(message)
 
 
 def test_an_unusable_instruction_set_of_the_environment_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(SIMD_VARIABLE, "mmx")
-    with pytest.raises(KernelError, match=SIMD_VARIABLE):
-        CpuRasterizer()
+    pytest.raises(KernelError, CpuRasterizer).match(SIMD_VARIABLE)

@@ -1,7 +1,5 @@
 """Gaussians are encoded as trainable rows and decoded again."""
 
-from __future__ import annotations
-
 import numpy as np
 from sample_gaussians import some_gaussians
 

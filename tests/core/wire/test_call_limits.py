@@ -1,7 +1,5 @@
 """One caller cannot take a whole server: open calls, bandwidth and connections are limited."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket
@@ -95,11 +93,8 @@ def test_a_certificate_has_its_own_limit_and_the_others_go_on(tmp_path: Path) ->
         watches = [greedy.watch() for _ in range(CallLimits().calls)]
         for watch in watches[: CallLimits().calls]:
             next(watch)
-        with (
-            FusionClient(fusion.client.address, tls=identity(certs, "husky-1")) as again,
-            pytest.raises(RateLimitError, match="open ones from husky-1"),
-        ):
-            again.join("husky-1", GRID)
+        with FusionClient(fusion.client.address, tls=identity(certs, "husky-1")) as again:
+            pytest.raises(RateLimitError, again.join, "husky-1", GRID).match("open ones from husky-1")
         assert operator.status().fused_gaussians == 0
         for watch in watches:
             watch.close()
@@ -170,5 +165,4 @@ def test_a_connection_without_a_call_is_closed() -> None:
 
 
 def test_limits_are_at_least_one() -> None:
-    with pytest.raises(InvalidInputError, match="connections: expected at least 1, got 0"):
-        CallLimits(connections=0)
+    pytest.raises(InvalidInputError, CallLimits, connections=0).match("connections: expected at least 1, got 0")

@@ -1,7 +1,5 @@
 """Clients after `close`, and the threads that a failed stream leaves."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 
@@ -35,8 +33,7 @@ def test_a_closed_client_says_so(call: Callable[[AgentClient, FusionClient], obj
     for client in (agent, fusion):
         client.close()
         client.close()
-    with pytest.raises(UnavailableError, match="expected an open client, got one that was closed"):
-        call(agent, fusion)
+    pytest.raises(UnavailableError, call, agent, fusion).match("expected an open client, got one that was closed")
 
 
 def test_no_thread_reads_frames_after_a_failed_stream() -> None:
@@ -65,8 +62,7 @@ def test_an_error_through_a_proxy_names_its_variable(monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("http_proxy", f"http://{NOBODY}")
     with pytest.raises(UnavailableError, match="the variable http_proxy states a proxy"):
         require_serving("robots.example.org:50052", None)
-    with pytest.raises(UnavailableError, match=f"^{NOBODY}: connection refused$"):
-        require_serving(NOBODY, None)
+    pytest.raises(UnavailableError, require_serving, NOBODY, None).match(f"^{NOBODY}: connection refused$")
 
 
 @pytest.mark.parametrize(

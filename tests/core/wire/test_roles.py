@@ -1,7 +1,5 @@
 """Roles of certificates: each call needs one, sessions belong to a certificate, and operators evict and ban."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -45,8 +43,7 @@ def test_every_method_of_the_services_has_its_roles() -> None:
     assert methods == set(ROLES_OF_METHOD)
     nobody = Caller("10.0.0.1", frozenset({"ant"}))
     for method in (*methods, "/gausslite.v1.FusionService/New"):
-        with pytest.raises(NotPermittedError, match=r"one of the roles .*, got none"):
-            require_role(method, nobody)
+        pytest.raises(NotPermittedError, require_role, method, nobody).match(r"one of the roles .*, got none")
 
 
 @pytest.mark.parametrize(("name", "role"), [("husky-1", Role.ROBOT), ("screen", Role.VIEWER), ("server", None)])
@@ -68,8 +65,7 @@ def test_a_certificate_gives_the_rights_of_its_role_only(name: str, role: Role |
             if role in ROLES_OF_METHOD[f"/gausslite.v1.FusionService/{method}"]:
                 call()
             else:
-                with pytest.raises(NotPermittedError, match=f"{method}: expected a certificate with one of the roles"):
-                    call()
+                pytest.raises(NotPermittedError, call).match(f"{method}: expected a certificate with one of the roles")
 
 
 def test_an_operator_evicts_and_bans(certs: Path) -> None:
@@ -82,14 +78,11 @@ def test_an_operator_evicts_and_bans(certs: Path) -> None:
         list(robot.contribute([request(session, make_subset("husky-1", 1, {0: [1], 1: [1]}))], 20.0))
         assert operator.evict("husky-1", ban=True) == 2
         assert list(operator.status().banned_agents) == ["husky-1"]
-        with pytest.raises(NotPermittedError, match="banned"):
-            robot.join("husky-1", GRID)
+        pytest.raises(NotPermittedError, robot.join, "husky-1", GRID).match("banned")
         operator.unban("husky-1")
         assert robot.join("husky-1", GRID).highest_update_seq == 0
-        with pytest.raises(InvalidInputError, match="expected a banned agent"):
-            operator.unban("husky-1")
-        with pytest.raises(NotPermittedError, match="one of the roles robot, got operator"):
-            operator.join("control", GRID)
+        pytest.raises(InvalidInputError, operator.unban, "husky-1").match("expected a banned agent")
+        pytest.raises(NotPermittedError, operator.join, "control", GRID).match("one of the roles robot, got operator")
 
 
 def test_a_session_is_of_use_only_to_the_certificate_that_opened_it(certs: Path) -> None:
@@ -101,8 +94,7 @@ def test_a_session_is_of_use_only_to_the_certificate_that_opened_it(certs: Path)
         session = owner.join("husky-1", GRID).session_id
         message = request(session, make_subset("husky-1", 1, {0: [1]}))
         for call in (lambda: list(thief.contribute([message], 20.0)), lambda: thief.leave(session, forget=True)):
-            with pytest.raises(NotPermittedError, match="'husky-1': expected a certificate that names it"):
-                call()
+            pytest.raises(NotPermittedError, call).match("'husky-1': expected a certificate that names it")
         assert len(list(owner.contribute([message], 20.0))) == 1
 
 

@@ -1,7 +1,5 @@
 """A round of the spool: work and reading are bounded by what it sends, and others use the spool meanwhile."""
 
-from __future__ import annotations
-
 import heapq
 import sqlite3
 import threading

@@ -1,7 +1,5 @@
 """Keyframes in the spool: one order with the voxel updates, kept over a restart, sent again if the server lost them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_batch

@@ -1,7 +1,5 @@
 """The table of errors and status codes: it contains every error, and clients raise the same class."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 from typing import Any
@@ -79,10 +77,8 @@ def test_each_error_has_its_documented_code_and_a_unique_reason() -> None:
 
 def test_a_status_without_our_details_gets_the_class_of_its_code() -> None:
     with serving([service(FailingParser())]) as server, ParserClient(server.address) as client:
-        with pytest.raises(errors.NotPermittedError, match="no certificate"):
-            client.parse("UNAUTHENTICATED")
-        with pytest.raises(QuotaError):
-            client.parse("x" * (MAX_MESSAGE_BYTES + 1))
+        pytest.raises(errors.NotPermittedError, client.parse, "UNAUTHENTICATED").match("no certificate")
+        pytest.raises(QuotaError, client.parse, "x" * (MAX_MESSAGE_BYTES + 1))
 
 
 @pytest.mark.parametrize(
@@ -112,9 +108,5 @@ def test_a_missed_deadline_is_unavailable() -> None:
         "gausslite.v1.ParserService",
         lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(Slow(), server),
     )
-    with (
-        serving([slow]) as server,
-        ParserClient(server.address, deadline_s=0.2) as client,
-        pytest.raises(UnavailableError, match=rf"^parser {server.address}: no answer in time"),
-    ):
-        client.parse("anything")
+    with serving([slow]) as server, ParserClient(server.address, deadline_s=0.2) as client:
+        pytest.raises(UnavailableError, client.parse, "anything").match(rf"^parser {server.address}: no answer in time")

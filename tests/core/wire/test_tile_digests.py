@@ -1,7 +1,5 @@
 """Digests of updates by tile: equal for equal updates in any order, and only changed tiles differ."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Encrypted services: accepted certificates, agent ids bound to certificates, and no secret in any output."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import signal
@@ -73,9 +71,8 @@ def test_a_server_with_another_name_is_refused(certs: Path, tmp_path: Path) -> N
     with (
         serving([parser_service(RuleParser())], "127.0.0.2:0", identity(certs, "server")) as elsewhere,
         ParserClient(elsewhere.address, deadline_s=1.0, tls=identity(certs, "husky-1")) as client,
-        pytest.raises(UnavailableError),
     ):
-        client.parse("Pick up the mug")
+        pytest.raises(UnavailableError, client.parse, "Pick up the mug")
     with (
         serving([parser_service(RuleParser())], "127.0.0.2:0", identity(certs, "away")) as elsewhere,
         ParserClient(elsewhere.address, tls=identity(certs, "husky-1")) as client,
@@ -201,5 +198,4 @@ def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFix
 
 
 def test_certificate_without_its_key_is_refused_by_name() -> None:
-    with pytest.raises(InvalidInputError, match="--tls-cert and --tls-key"):
-        Tls.read(Path("x.pem"), None, None)
+    pytest.raises(InvalidInputError, Tls.read, Path("x.pem"), None, None).match("--tls-cert and --tls-key")

@@ -1,7 +1,5 @@
 """The uplink with real servers: all updates arrive, in every situation."""
 
-from __future__ import annotations
-
 import sqlite3
 import threading
 from contextlib import closing
@@ -190,8 +188,7 @@ def test_a_spool_of_the_two_versions_before_goes_on(tmp_path: Path, earlier: str
         spool.close()
     with closing(sqlite3.connect(path)) as database:
         database.executescript(f"{_NO_ORDER}; ALTER TABLE voxel_updates DROP COLUMN acknowledged_seq")
-    with pytest.raises(StorageError, match="of another release; let that one send it"):
-        Spool(path, "robot", GRID)
+    pytest.raises(StorageError, Spool, path, "robot", GRID).match("of another release; let that one send it")
 
 
 def test_limit_drain_ends_a_drain_that_has_begun() -> None:
@@ -206,15 +203,11 @@ def test_limit_drain_ends_a_drain_that_has_begun() -> None:
 def test_the_spool_of_another_agent_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     Spool(path, "robot", GRID).close()
-    with pytest.raises(MismatchError, match="'other'"):
-        Spool(path, "other", GRID)
-    with pytest.raises(MismatchError, match=r"0\.5 m"):
-        Spool(path, "robot", VoxelGrid(0.5))
+    pytest.raises(MismatchError, Spool, path, "other", GRID).match("'other'")
+    pytest.raises(MismatchError, Spool, path, "robot", VoxelGrid(0.5)).match(r"0\.5 m")
     (tmp_path / "noise").write_bytes(b"noise" * 1000)
-    with pytest.raises(StorageError, match="noise"):
-        Spool(tmp_path / "noise", "robot", GRID)
-    with pytest.raises(StorageError, match="nowhere"):
-        Spool(tmp_path / "nowhere" / "spool", "robot", GRID)
+    pytest.raises(StorageError, Spool, tmp_path / "noise", "robot", GRID).match("noise")
+    pytest.raises(StorageError, Spool, tmp_path / "nowhere" / "spool", "robot", GRID).match("nowhere")
 
 
 @pytest.mark.parametrize("wrong", [{"kbps": 0.0}, {"kbps": float("nan")}, {"interval_s": -1.0}, {"deadline_s": 0.0}])

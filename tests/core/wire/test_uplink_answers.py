@@ -1,7 +1,5 @@
 """The uplink's reaction to each answer of a server, and to every loss of messages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

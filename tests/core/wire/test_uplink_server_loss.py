@@ -1,7 +1,5 @@
 """An idle uplink notices that the server has lost updates, and sends them again."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from pathlib import Path

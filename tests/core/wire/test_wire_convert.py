@@ -1,7 +1,5 @@
 """Conversion between messages and domain objects, and the refusal of invalid messages."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import zlib
@@ -119,8 +117,7 @@ def test_an_invalid_graph_is_refused(change: dict[str, object]) -> None:
     for name in change:
         message.ClearField(name)  # type: ignore[arg-type]
     message.MergeFrom(task_pb2.TaskGraph(**change))  # type: ignore[arg-type]
-    with pytest.raises(TaskError, match=r"^task "):
-        convert_task.graph_from_message(message)
+    pytest.raises(TaskError, convert_task.graph_from_message, message).match(r"^task ")
 
 
 def bomb_png(width: int, height: int) -> bytes:
@@ -150,8 +147,7 @@ def test_a_bad_frame_names_its_field(name: str, value: object, message: str) -> 
     encoded = convert.frame_to_message(sample_frame())
     encoded.ClearField(name)  # type: ignore[arg-type]
     encoded.MergeFrom(geometry_pb2.EncodedFrame(**{name: value}))  # type: ignore[arg-type]
-    with pytest.raises(InvalidInputError, match=message):
-        convert.frame_from_message(encoded)
+    pytest.raises(InvalidInputError, convert.frame_from_message, encoded).match(message)
 
 
 @pytest.mark.parametrize(
@@ -164,8 +160,7 @@ def test_a_bad_frame_names_its_field(name: str, value: object, message: str) -> 
 def test_a_pose_that_is_not_rigid_or_too_far_is_refused(place: int, value: float, message: str) -> None:
     encoded = convert.frame_to_message(sample_frame())
     encoded.t_world_camera.row_major[place] = value
-    with pytest.raises(PoseError, match=message):
-        convert.frame_from_message(encoded)
+    pytest.raises(PoseError, convert.frame_from_message, encoded).match(message)
 
 
 MOTION = CameraMotion(Twist(np.array([0.3, -0.1, 0.2]), np.array([0.5, 1.5, -0.4])), readout_s=0.03, exposure_s=0.01)
@@ -214,8 +209,7 @@ def test_a_frame_with_a_lens_is_refused_where_nothing_corrects_it() -> None:
 def test_a_wrong_lens_or_motion_is_refused_by_name(change: dict[str, object], expected: str) -> None:
     encoded = convert.frame_to_message(sample_frame())
     encoded.MergeFrom(geometry_pb2.EncodedFrame(**change))  # type: ignore[arg-type]
-    with pytest.raises(InvalidInputError, match=expected):
-        convert.live_frame_from_message(encoded)
+    pytest.raises(InvalidInputError, convert.live_frame_from_message, encoded).match(expected)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=8, max_size=8), st.sampled_from(["radtan", "fisheye"]))
@@ -258,8 +252,7 @@ def test_image_sizes_are_read_from_any_bytes(noise: bytes) -> None:
         size = image_size(head + noise)
         assert size is None or (len(size) == 2 and min(size) >= 0)
     assert image_size(bomb_png(640, 480) + noise) == (640, 480)
-    with pytest.raises(InvalidInputError):
-        decode_colour(noise, 64, 48)
+    pytest.raises(InvalidInputError, decode_colour, noise, 64, 48)
 
 
 def test_image_sizes() -> None:
@@ -272,8 +265,7 @@ def test_a_png_chunk_longer_than_the_message_is_refused_before_it_is_allocated(l
     data = bytearray(encode_colour(np.zeros((48, 64, 3), np.uint8), lossless=True))
     start = data.index(b"IDAT") - 4
     data[start : start + 4] = length.to_bytes(4, "big")
-    with pytest.raises(InvalidInputError, match="a chunk ends outside"):
-        decode_colour(bytes(data), 64, 48)
+    pytest.raises(InvalidInputError, decode_colour, bytes(data), 64, 48).match("a chunk ends outside")
 
 
 def test_a_map_block_is_checked() -> None:

@@ -1,7 +1,5 @@
 """Expensive work of calls: fair turns, a bounded queue that refuses by name, and answers that nobody reads."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable

@@ -1,7 +1,5 @@
 """The mapping worker under load: dropped frames, idle training and their reports."""
 
-from __future__ import annotations
-
 import itertools
 import sqlite3
 import threading
@@ -171,8 +169,7 @@ def test_waiting_frames_are_dropped_at_shutdown() -> None:
     threading.Timer(0.05, gate.opened.set).start()
     worker.close()
     assert [future.result(0).outcome for future in futures] == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED]
-    with pytest.raises(UnavailableError, match="shutting down"):
-        worker.run(lambda mapper: mapper.table.count)
+    pytest.raises(UnavailableError, worker.run, lambda mapper: mapper.table.count).match("shutting down")
 
 
 def test_a_frame_larger_than_a_message_is_made_smaller_and_the_stream_continues(robot: Agent) -> None:

@@ -1,7 +1,5 @@
 """A whole mission: a replayed sequence gives a map, a report and its region on the server."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import signal
@@ -204,13 +202,9 @@ def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:
     options = settings(tmp_path)
     with agent_mission(replace(options, task="!")) as (mission, _), pytest.raises(TaskError):
         mission.run(stream_of(Wall(), options))
-    with pytest.raises(InvalidInputError, match="size"):
-        FrameStream.select(Wall(), SourceSettings("wall", size="big"))
-    with (
-        agent_mission(replace(options, out=tmp_path / "gone")) as (mission, _),
-        pytest.raises(StorageError, match="gone"),
-    ):
-        mission.run(stream_of(Wall(), options))
+    pytest.raises(InvalidInputError, FrameStream.select, Wall(), SourceSettings("wall", size="big")).match("size")
+    with agent_mission(replace(options, out=tmp_path / "gone")) as (mission, _):
+        pytest.raises(StorageError, mission.run, stream_of(Wall(), options)).match("gone")
 
 
 @pytest.mark.parametrize(
@@ -286,8 +280,8 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
     "numbers",
     [
         (signal.SIGTERM,),
-        pytest.param((signal.SIGHUP,), marks=hangup),
-        pytest.param((signal.SIGINT, signal.SIGINT, signal.SIGTERM), id="a launcher"),
+        pytest.param((signal.SIGHUP,), marks=[hangup, pytest.mark.slow]),
+        pytest.param((signal.SIGINT, signal.SIGINT, signal.SIGTERM), id="a launcher", marks=pytest.mark.slow),
     ],
 )
 def test_received_frames_give_a_map_and_a_report_on_signals(tmp_path: Path, numbers: tuple[signal.Signals]) -> None:
@@ -329,8 +323,7 @@ def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_
 ) -> None:
     options = settings(tmp_path, "--set", "strict=true")
     with agent_mission(options, fusion.client.address) as (mission, _):
-        with pytest.raises(DatasetError, match="frame-3"):
-            mission.run(stream_of(Wall(broken_at=3), options))
+        pytest.raises(DatasetError, mission.run, stream_of(Wall(broken_at=3), options)).match("frame-3")
         [agent] = fusion.client.status().agents
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["frames"] == 3

@@ -1,7 +1,5 @@
 """The agent service in this process: every call, every frame outcome, every status code."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import threading
@@ -124,8 +122,7 @@ def test_pointing_at_nothing_is_refused_and_changes_nothing(pointed: PointedObje
     with agent(no_detector) as a:
         a.client.assign_task(TASK)
         a.worker.submit(stepped(0)).result(20)
-        with pytest.raises(InvalidInputError, match=match):
-            a.client.assign_task(pointed=[pointed])
+        pytest.raises(InvalidInputError, a.client.assign_task, pointed=[pointed]).match(match)
         assert convert_task.graph_from_message(a.client.status().graph) == RuleParser().parse(TASK)
 
 
@@ -145,11 +142,10 @@ def test_a_refused_task_is_not_logged_as_an_error_that_nobody_has_looked_at() ->
     assert unseen == []
 
 
-def test_an_invalid_task_is_refused(robot: Agent) -> None:
-    with pytest.raises(TaskError):
-        robot.client.assign_task(" ")
-    with pytest.raises(TaskError, match="targets"):
-        robot.client.assign_task(TaskGraph("", "", (), (), ()))
+def test_an_invalid_task_and_frames_before_a_task_are_refused(robot: Agent) -> None:
+    pytest.raises(TaskError, robot.client.assign_task, " ")
+    pytest.raises(TaskError, robot.client.assign_task, TaskGraph("", "", (), (), ())).match("targets")
+    pytest.raises(MismatchError, lambda: list(robot.client.ingest([frame(0)]))).match("AssignTask")
     with pytest.raises(grpc.RpcError) as caught:
         robot.stub.AssignTask(pb.AssignTaskRequest())
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
@@ -161,11 +157,6 @@ def test_assign_task_raises_the_error_of_the_estimator() -> None:
 
     with agent(broken) as a, pytest.raises(ModelFileError, match=r"model\.onnx"):
         a.client.assign_task(TASK)
-
-
-def test_frames_need_a_task_first(robot: Agent) -> None:
-    with pytest.raises(MismatchError, match="AssignTask"):
-        list(robot.client.ingest([frame(0)]))
 
 
 def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() -> None:
@@ -463,8 +454,7 @@ def test_an_upside_down_region_is_refused(robot: Agent) -> None:
     with pytest.raises(grpc.RpcError) as caught:
         next(robot.stub.WatchMap(request))
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT  # type: ignore[attr-defined]
-    with pytest.raises(InvalidInputError, match="box"):
-        AxisAlignedBox((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    pytest.raises(InvalidInputError, AxisAlignedBox, (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)).match("box")
 
 
 def test_only_the_tasks_region_leaves_the_robot() -> None:

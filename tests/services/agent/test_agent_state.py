@@ -1,7 +1,5 @@
 """A mission saved with --state continues after a restart of the agent, also on the fusion server."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The page of an agent in a real browser: its map appears, and a task assigned there arrives at the agent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2
@@ -175,5 +173,4 @@ def test_the_own_address_can_be_called(listen, expected):
 
 
 def test_a_service_with_a_random_port_has_no_page():
-    with pytest.raises(InvalidInputError, match="fixed port"):
-        own_address("127.0.0.1:0")
+    pytest.raises(InvalidInputError, own_address, "127.0.0.1:0").match("fixed port")

@@ -1,7 +1,5 @@
 """A mission of streamed frames ends by EndMission or SIGTERM: drained, handed over, saved, and the next one begins."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -30,8 +28,7 @@ def state_name(client: AgentClient) -> str:
 def test_end_mission_drains_and_a_task_begins_the_next_mission(fusion: RunningServer) -> None:
     with uplink(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
         assert state_name(a.client) == "WAITING_FOR_TASK"
-        with pytest.raises(MismatchError, match="call AssignTask"):
-            a.client.end_mission()
+        pytest.raises(MismatchError, a.client.end_mission).match("call AssignTask")
         a.client.assign_task(TASK)
         assert state_name(a.client) == "MAPPING"
         list(a.client.ingest([frame(index) for index in range(6)]))
@@ -75,8 +72,7 @@ def test_an_unreachable_server_leaves_data_and_the_summary_says_how_much() -> No
 
 @pytest.mark.parametrize("drain_s", [-1.0, float("nan"), 1e9])
 def test_an_impossible_drain_time_is_refused(drain_s: float) -> None:
-    with pytest.raises(InvalidInputError, match="drain_seconds"):
-        EndRequest(False, drain_s)
+    pytest.raises(InvalidInputError, EndRequest, False, drain_s).match("drain_seconds")
 
 
 def test_two_callers_get_the_result_of_one_end(fusion: RunningServer) -> None:
@@ -113,8 +109,7 @@ def test_calls_that_wait_for_the_end_leave_threads_to_others(
 
 def test_a_phase_that_cannot_follow_is_refused() -> None:
     phases = MissionStateMachine()
-    with pytest.raises(MismatchError, match="waiting for task, got ended"):
-        phases.enter(MissionState.ENDED)
+    pytest.raises(MismatchError, phases.enter, MissionState.ENDED).match("waiting for task, got ended")
     phases.enter(MissionState.MAPPING)
     phases.enter(MissionState.FAILED, "the disk is full")
     assert phases.failure == "the disk is full"
@@ -201,8 +196,7 @@ def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp
         assert process.stderr is not None
         lines = [process.stderr.readline() for _ in range(2)]
         with AgentClient(address) as client:
-            with pytest.raises(MismatchError, match="--detector"):
-                client.assign_task(TASK)
+            pytest.raises(MismatchError, client.assign_task, TASK).match("--detector")
             assert any("--detector" in note for note in client.status().notes)
         process.terminate()
         assert process.wait(30) == 0

@@ -1,7 +1,5 @@
 """The agent waits for its parser service, and ends the wait at once on SIGTERM."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -39,10 +37,8 @@ def test_a_parser_that_starts_later_is_used() -> None:
 
 
 def test_the_wait_ends_after_its_timeout_and_for_an_invalid_task() -> None:
-    with pytest.raises(UnavailableError, match="refused"):
-        WaitingParser(LateParser(99), timeout_s=0.0).parse(TASK)
-    with pytest.raises(TaskError):
-        WaitingParser(LateParser(0)).parse("!")
+    pytest.raises(UnavailableError, WaitingParser(LateParser(99), timeout_s=0.0).parse, TASK).match("refused")
+    pytest.raises(TaskError, WaitingParser(LateParser(0)).parse, "!")
 
 
 def test_stop_ends_the_wait() -> None:

@@ -1,7 +1,5 @@
 """The commands that reach a running team: status, end, refine and fetch, against real services."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The fusion server answers random bytes with a documented code and keeps serving."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass

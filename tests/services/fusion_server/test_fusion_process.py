@@ -1,7 +1,5 @@
 """The fusion server as a process: command line, SIGTERM, and restart after a kill."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import socket
@@ -53,8 +51,7 @@ def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -
         watch = client.watch()
         next(watch)
         process.send_signal(signal.SIGTERM)
-        with pytest.raises(UnavailableError):
-            next(watch)
+        pytest.raises(UnavailableError, next, watch)
         assert process.wait(20) == 0
     assert "Traceback" not in log.read_text()
     assert log.read_text().rstrip().endswith("ended")
@@ -136,8 +133,7 @@ def test_a_watcher_detects_a_server_that_stopped_answering() -> None:
         watch = hasty.watch()
         next(watch)
         process.send_signal(signal.SIGSTOP)
-        with pytest.raises(UnavailableError):
-            next(watch)
+        pytest.raises(UnavailableError, next, watch)
 
 
 def ends_with_one_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -157,8 +153,7 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
     secret = "postgresql://ant:kept-secret@127.0.0.1:1/team"
     limited = ends_with_one_line(capsys, "--store", secret, "--set", "store-max-mb=9")
     assert "store-max-mb: expected a file" in limited
-    with pytest.raises(SystemExit):
-        run([secret])
+    pytest.raises(SystemExit, run, [secret])
     assert "kept-secret" not in capsys.readouterr().err
     for url in (secret, secret.replace("ant", "ant@"), secret.replace("postgresql", "postgres")):
         assert "kept-secret" not in ends_with_one_line(capsys, "--store", url)

@@ -1,7 +1,5 @@
 """Keyframes and the joint refinement, on a real server in process."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset, photograph
@@ -47,8 +45,7 @@ def contributed(t: RunningServer) -> str:
 
 
 def test_refinement_reports_progress_and_its_map_shows_newer_votes(fusion: RunningServer) -> None:
-    with pytest.raises(MismatchError, match="refined map"):
-        fusion.client.export(Export("refined"))
+    pytest.raises(MismatchError, fusion.client.export, Export("refined")).match("refined map")
     session = contributed(fusion)
     progress = list(fusion.client.refine(iterations=4))
     assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
@@ -59,8 +56,7 @@ def test_refinement_reports_progress_and_its_map_shows_newer_votes(fusion: Runni
     assert refined.rgb.tobytes() != voted.rgb.tobytes()
     fusion.contribute_subsets(session, make_subset("ant", 2, {0: [90]}))
     assert sorted(gaussians_from_ply(fusion.client.export(Export("refined"))).kappa.tolist())[-1] == 90
-    with pytest.raises(InvalidInputError, match="expected none with REFINED"):
-        fusion.client.export(Export("refined", "ant"))
+    pytest.raises(InvalidInputError, fusion.client.export, Export("refined", "ant")).match("expected none with REFINED")
 
 
 def test_closing_the_refinement_cancels_it_and_another_can_start() -> None:

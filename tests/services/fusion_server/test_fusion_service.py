@@ -1,7 +1,5 @@
 """Joining, contributing and exporting on a real fusion server in process, and every error code."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 
@@ -87,8 +85,7 @@ def test_a_robot_whose_agent_id_another_one_uses_is_refused(fusion: RunningServe
     first, second = (fusion.client.join("ant", GRID).session_id for _ in range(2))
     with pytest.raises(MismatchError, match="another robot uses this name"):
         fusion.contribute_subsets(first, make_subset("ant", 1, {0: [1]}))
-    with pytest.raises(MismatchError):
-        fusion.client.leave(first)
+    pytest.raises(MismatchError, fusion.client.leave, first)
     other = FusionClient(fusion.client.address)
     with other, pytest.raises(NameInUseError, match="end of its lease") as refused:
         other.join("ant", GRID)
@@ -97,20 +94,16 @@ def test_a_robot_whose_agent_id_another_one_uses_is_refused(fusion: RunningServe
 
 
 def test_the_error_of_an_unknown_session_asks_to_join_again(fusion: RunningServer) -> None:
-    with pytest.raises(SessionUnknownError):
-        fusion.contribute_subsets("never given", make_subset("ant", 1, {0: [1]}))
-    with pytest.raises(SessionUnknownError):
-        fusion.client.contribute_keyframes("never given", [frame(0)])
-    with pytest.raises(SessionUnknownError):
-        fusion.client.leave("never given")
+    pytest.raises(SessionUnknownError, fusion.contribute_subsets, "never given", make_subset("ant", 1, {0: [1]}))
+    pytest.raises(SessionUnknownError, fusion.client.contribute_keyframes, "never given", [frame(0)])
+    pytest.raises(SessionUnknownError, fusion.client.leave, "never given")
     with pytest.raises(grpc.RpcError) as caught:
         fusion.stub.LeaveSession(pb.LeaveSessionRequest(session_id="x"))
     assert caught.value.code() is grpc.StatusCode.NOT_FOUND
 
 
 def test_another_mission_config_is_a_mismatch_that_names_both_values(fusion: RunningServer) -> None:
-    with pytest.raises(MismatchError, match=r"0\.1 m, got 0\.2 m"):
-        fusion.client.join("ant", VoxelGrid(0.2))
+    pytest.raises(MismatchError, fusion.client.join, "ant", VoxelGrid(0.2)).match(r"0\.1 m, got 0\.2 m")
     session = fusion.client.join("ant", GRID, world_frame="map").session_id
     fusion.client.join("bee", GRID)
     with pytest.raises(MismatchError, match="world frame: expected 'map' as agreed here, got 'odom'"):
@@ -118,12 +111,10 @@ def test_another_mission_config_is_a_mismatch_that_names_both_values(fusion: Run
     fusion.client.mission_id = "other"
     for call in (lambda: fusion.client.join("cat", GRID), fusion.client.status, lambda: fusion.client.export(Export()),
                  lambda: next(fusion.client.watch()), lambda: next(fusion.client.refine())):  # fmt: skip
-        with pytest.raises(MismatchError, match="mission: expected 'mission' as agreed here, got 'other'"):
-            call()
+        pytest.raises(MismatchError, call).match("mission: expected 'mission' as agreed here, got 'other'")
     coarse = VoxelGrid(1.0)
     subset = RoiSubset("ant", "", 1, 1, make_batch({}))
-    with pytest.raises(MismatchError, match="voxel size"):
-        fusion.contribute_subsets(session, subset, grid=coarse)
+    pytest.raises(MismatchError, fusion.contribute_subsets, session, subset, grid=coarse).match("voxel size")
 
 
 def test_names_of_agents_and_missions_have_a_safe_alphabet(fusion: RunningServer) -> None:
@@ -159,10 +150,8 @@ def test_a_fresh_map_begins_at_zero_and_a_forgotten_agent_leaves_no_updates(fusi
 
 
 def test_an_export_of_an_unknown_agent_or_strategy_is_invalid(fusion: RunningServer) -> None:
-    with pytest.raises(InvalidInputError, match="no agents yet"):
-        fusion.client.export(Export("vote", "ant"))
-    with pytest.raises(InvalidInputError, match="strategy"):
-        fusion.client.export(Export("unspecified"))
+    pytest.raises(InvalidInputError, fusion.client.export, Export("vote", "ant")).match("no agents yet")
+    pytest.raises(InvalidInputError, fusion.client.export, Export("unspecified")).match("strategy")
 
 
 def test_a_full_store_ends_the_stream_and_the_server_keeps_serving(tmp_path: Path) -> None:
@@ -202,8 +191,7 @@ def test_a_restarted_server_keeps_its_sessions_only_with_a_file(tmp_path: Path) 
         with pytest.raises(RevisionGoneError):
             next(t.client.watch(seen))
         assert t.contribute_subsets(session, make_subset("ant", 2, {2: [1]}))[0].status == ACCEPTED
-        with pytest.raises(MismatchError, match="'map'"):
-            t.client.join("bee", GRID, world_frame="odom")
+        pytest.raises(MismatchError, t.client.join, "bee", GRID, world_frame="odom").match("'map'")
     with pytest.raises(MismatchError, match="voxel size"), fusion_server(store, FusionSettings(grid=VoxelGrid(0.2))):
         pass
     store.close()
@@ -223,8 +211,7 @@ def test_a_draining_server_ends_open_streams_and_refuses_new_calls(fusion: Runni
     assert next(stream).acknowledged == 1
     next(watch)
     fusion.drain()
-    with pytest.raises(UnavailableError, match="draining"):
-        next(watch)
+    pytest.raises(UnavailableError, next, watch).match("draining")
     with pytest.raises(grpc.RpcError) as caught:
         next(stream)
     assert caught.value.code() is grpc.StatusCode.UNAVAILABLE

@@ -1,7 +1,5 @@
 """The page of a fusion server: the fused map with each Gaussian's agent and object, and one agent's own map."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

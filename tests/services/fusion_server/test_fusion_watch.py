@@ -1,7 +1,5 @@
 """A slow watcher gets the sum of the changes it missed: nothing is queued or lost."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from unittest.mock import Mock

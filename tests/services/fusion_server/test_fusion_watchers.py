@@ -1,7 +1,5 @@
 """Watchers of the fused map on a real server in process: a snapshot, then changes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import grpc

@@ -1,7 +1,5 @@
 """The parser service serves a parser that another distribution registers, with options of its own."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Mapping

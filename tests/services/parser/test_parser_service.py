@@ -1,7 +1,5 @@
 """The parser service in process: graphs, status codes, health, reflection, and an address in use."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 
@@ -37,15 +35,13 @@ def test_unix_socket(tmp_path: Path) -> None:
     listen = f"unix:{tmp_path}/parser.sock"
     with serving([parser_service(RuleParser())], listen) as server, ParserClient(server.address) as client:
         assert client.parse("Pick up the mug on the table").targets == ("mug",)
-        with pytest.raises(UnavailableError, match="another server listens"):
-            asyncio.run(start_server(listen, []))
+        pytest.raises(UnavailableError, asyncio.run, start_server(listen, [])).match("another server listens")
 
 
 @pytest.mark.parametrize("text", ["", "   ", "x" * 100_000])
 def test_an_invalid_task_is_a_task_error(text: str) -> None:
     with serving([parser_service(RuleParser())]) as server, ParserClient(server.address) as client:
-        with pytest.raises(TaskError):
-            client.parse(text)
+        pytest.raises(TaskError, client.parse, text)
         assert client.parse("Pick up the mug").targets == ("mug",)
 
 
@@ -79,8 +75,7 @@ def test_health_and_reflection() -> None:
 
 def test_an_address_in_use_is_one_line_and_code_2() -> None:
     with serving([parser_service(RuleParser())], "127.0.0.1:0") as server:
-        with pytest.raises(UnavailableError, match="in use"):
-            asyncio.run(start_server(server.address, []))
+        pytest.raises(UnavailableError, asyncio.run, start_server(server.address, [])).match("in use")
         ended = run_python("-m", "gausslite_parser", "--listen", server.address)
     assert ended.returncode == 2
     assert ended.stdout == ""
@@ -90,8 +85,7 @@ def test_an_address_in_use_is_one_line_and_code_2() -> None:
 
 @pytest.mark.parametrize("listen", ["nowhere", "localhost:port", "localhost:70000", ":50051", "", "h:" + "9" * 5000])
 def test_an_invalid_address_is_refused(listen: str) -> None:
-    with pytest.raises(InvalidInputError, match="HOST:PORT"):
-        asyncio.run(start_server(listen, []))
+    pytest.raises(InvalidInputError, asyncio.run, start_server(listen, [])).match("HOST:PORT")
 
 
 @pytest.mark.slow
@@ -113,11 +107,8 @@ def test_an_impossible_socket_is_one_line_and_code_2(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "unix:/nowhere/parser.sock"])
 def test_an_address_without_a_service_is_connection_refused(address: str) -> None:
-    with (
-        ParserClient(address, deadline_s=5.0) as client,
-        pytest.raises(UnavailableError, match=r"^parser .*: connection refused$"),
-    ):
-        client.parse("Pick up the mug")
+    with ParserClient(address, deadline_s=5.0) as client:
+        pytest.raises(UnavailableError, client.parse, "Pick up the mug").match(r"^parser .*: connection refused$")
 
 
 def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> None:

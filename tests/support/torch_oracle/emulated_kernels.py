@@ -4,8 +4,6 @@ gsplat compiles its kernels for CUDA only. Its torch versions of the two project
 compositing are the oracle's, with gsplat's two different rules (GSPLAT_LIMITS).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """The oracle of all backends, in torch: checks, projection, compositing, the loss of Eq. (2), Adam."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Python imports this file at its start if its folder is in PYTHONPATH. HIDDEN_PACKAGES: their import names, by commas.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Collection
