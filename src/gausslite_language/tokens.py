@@ -8,7 +8,7 @@ from typing import Final
 
 from gausslite_language import lexicon
 from gausslite_language.lexicon import COLOURS, COMPARATIVES
-from gausslite_language.verbs import TABLES
+from gausslite_language.verbs import PUSHING_VERBS, TABLES
 
 _NUMBERS: Final[dict[str, float]] = TABLES["numbers"]
 # metres by the first letters of a unit
@@ -113,7 +113,7 @@ _END: Final = r"(?: instead)?(?=$| ?[,.;])"
 _NAMED: Final = r"(?:the|an?|my|that|this)(?: \w+){1,3}?"
 CORRECTION_MARKER: Final = "nowait"
 _CORRECTS: Final = (
-    r"no,? (?:wait|sorry|no)|wait,? no|i meant?|(?:scratch|strike|cancel|forget) that(?=[,.;:]| the\b)|"
+    r"no,? (?:wait|sorry|no|just|only)|wait,? no|i meant?|(?:scratch|strike|cancel|forget) that(?=[,.;:]| the\b)|"
     r"on second thoughts?|or (?:rather|better)(?: still| yet)?|make (?:that|it)(?= (?:the|an?|my|that)\b)|"
     r"(?:correction|never ?mind|disregard|hold on|hang on)(?=[,.;:])"
 )
@@ -154,6 +154,8 @@ _PLAIN: Final = {
     r"(?:(?:if |when |while |as )?(?:you (?:are )?)?(?:facing|looking at)|(?:if|when|as) you (?:face|look at)) "
     r"([\w ]{2,40}),(?: (?:it|that) is)?": r"there is \1;",
     r"tell (?:me|us)": "report",
+    rf"((?:{'|'.join(PUSHING_VERBS)}) (?:the|my|an?|this) (?:\w+ ){{0,3}}?\w*[^s\W]) apart from": r"\1 away from",
+    r"(?:for (?:instance|example)|e\.g\.?),?|(?:real|super) (?:good|well|fast|quick|slow|careful)": "",
     r",? (?:if|when|while|as)(?: you)?(?: are)? (?:facing|looking(?: at| from)|face|look at|enter|entering) "
     rf"[\w ]{{2,40}}?{_END}": "",
     # what is denied of a place
@@ -181,7 +183,7 @@ _PLAIN: Final = {
     r"(?:is|are) (?:what|the ones?)(?: that)? (?:i|we|you) (?:want|need|mean|(?:are )?(?:look|search)ing for)": "",
     r"(?:, ?(?:but |and )?|(?:but|and) )(?:only|just)(?: the| those)?(?= (?:\w+ ){1,2}ones?\b)": " ( the",
     r",? ?(?:and |but )?(?:nothing (?:else|more)|(?:ignore|skip) (?:everything|all) else|no others?(?: \w+)?)|"
-    r"nothing (?:but|except|other than)": "",
+    r"nothing (?:but|except|other than)|(?:the )?(?:rest|others?) (?:i )?do ?n[o']?t (?:care|matter|mind)": "",
     # where the robot starts gives nothing; a viewpoint is an object to pass
     r"^(?:you (?:stand|are standing|are starting)|(?:you )?(?:start|begin|starting|beginning) (?:at|in|from|by|next))\b"
     r"[^.;,]*[.;,]": "",
@@ -221,9 +223,7 @@ _PLAIN: Final = {
     r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
     rf"{_LIMIT} (?:once|twice)|(?:{_LIMIT} )?{_VALUE} times|{_LIMIT}(?= {_VALUE} (?!{_UNIT}\b))": "",
     r"after (?:that|this)(?= \w)": "then",
-    r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
-        "handle"
-    ),
+    r"(?:do ?n[o']?t|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": "handle",
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)|"
     r"(?:^|(?<=[.;,] ))you (?:will )?(?:see|find|notice)": "i see",
     r"(?<=\w )you will (?:see|find|notice)(?= (?:the|an?)\b)": "; i see",

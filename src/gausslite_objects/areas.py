@@ -59,15 +59,19 @@ class Area:
 
     def contains(self, point_m: Point, up_axis: UpAxis) -> bool:
         """Return True for a point above the polygon, up to the height of a storey."""
+        return self.distance_m(point_m, up_axis) == 0.0
+
+    def distance_m(self, point_m: Point, up_axis: UpAxis) -> float:
+        """Return how far a point is from above the polygon, 0 there; infinite on another storey."""
         up = np.array(unit_up_axis(up_axis))
         corners_m, point = np.array(self.corners_m), np.array(point_m)
         height_m = float((point - corners_m.mean(axis=0)) @ up)
         if not _STOREY_M[0] <= height_m <= _STOREY_M[1]:
-            return False
+            return np.inf
         plane = _horizontal_axes(up)
         # relative to the point: float32 has no room for large coordinates
         outline = np.ascontiguousarray((corners_m - point) @ plane, np.float32)
-        return cv2.pointPolygonTest(outline, (0.0, 0.0), False) >= 0
+        return max(0.0, -cv2.pointPolygonTest(outline, (0.0, 0.0), True))
 
     def as_json(self) -> dict[str, Any]:
         """Return the area as JSON values."""
@@ -157,8 +161,19 @@ class NamedPlaces:
 
     def contain(self, point_m: Point, up_axis: UpAxis) -> bool:
         """Return True for a point in these places."""
-        is_inside = all(area.contains(point_m, up_axis) for area in self.inside)
-        return is_inside and not any(area.contains(point_m, up_axis) for area in self.outside)
+        return self._distance_m(point_m, up_axis) == 0.0
+
+    def left_out_note(self, found: Sequence[Point], up_axis: UpAxis) -> str:
+        """Return a line about objects that a question means, of which none is in these places."""
+        places = [f"in {area.name!r}" for area in self.inside] + [f"outside {area.name!r}" for area in self.outside]
+        nearest_m = min(self._distance_m(point_m, up_axis) for point_m in found)
+        nearest = f": the nearest is {nearest_m:.1f} m away" if 0.0 < nearest_m < np.inf else ""
+        return f"{len(found)} seen, none {' and '.join(places)}{nearest}"
+
+    def _distance_m(self, point_m: Point, up_axis: UpAxis) -> float:
+        """Return how far a point is from the farthest of these places; infinite in an area that is left out."""
+        is_left_out = any(area.contains(point_m, up_axis) for area in self.outside)
+        return max([np.inf if is_left_out else 0.0, *(area.distance_m(point_m, up_axis) for area in self.inside)])
 
 
 @dataclass(frozen=True, slots=True)

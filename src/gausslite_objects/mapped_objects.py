@@ -109,7 +109,13 @@ def select(place: MappedObjects, question: str) -> tuple[Sequence[TeamObject], S
         raise InvalidInputError(f"QUESTION: {error}") from error
     by_id = {team_object.landmark.object_id: team_object for team_object in objects}
     answer: Callable[..., Answer] = load(Group.QUESTIONS, purpose="questions")
-    found = answer(graph, [team_object.landmark for team_object in objects], place.up_axis, place.T_world_camera)
+
+    def ask(asked: Sequence[TeamObject]) -> Answer:
+        return answer(graph, [own.landmark for own in asked], place.up_axis, place.T_world_camera)
+
+    found = ask(objects)
+    if not found.objects and (elsewhere := ask(place.objects).objects):
+        return (), (named.left_out_note([landmark.centroid_m for landmark in elsewhere], place.up_axis),)
     anchors = [own.anchor for own in graph.relations if own.predicate is Predicate.INSIDE and not found.objects]
     unknown = [describe_unknown(name, place.areas) for name in dict.fromkeys((*graph.context, *anchors))]
     return [by_id[landmark.object_id] for landmark in found.objects], (*found.notes, *unknown)

@@ -18,6 +18,7 @@ from gausslite.domain.task import Superlative, TaskGraph, noun_of
 from gausslite.nouns import meant_by
 from gausslite.perception.object_map import Landmark, Observation
 from gausslite.perception.relations import RelationFilter
+from gausslite_selection.left_out import left_out_note
 from gausslite_selection.selector import AttributeSelector
 
 _BOX_STEP_M = 0.05
@@ -56,6 +57,7 @@ def answer(
         fitting = [
             thing for thing, seen_now in zip(seen, observed, strict=True) if relations.satisfies(target, seen_now)
         ]
+        notes += filter(None, [left_out_note(graph, target, observed, selector, mapped)])
         superlative = superlatives.get(target)
         if fitting and superlative is not None:
             if superlative in _OF_A_VIEWPOINT and T_world_camera is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -18,6 +18,7 @@ from gausslite.perception.object_map import Landmark, Measured, Observation
 from gausslite.perception.selector import Fit, Selector, TaskObjects
 from gausslite_selection import relations as spatial
 from gausslite_selection.colours import ColourFilter, mask_colours, no_colours
+from gausslite_selection.left_out import left_out_note
 from gausslite_selection.superlatives import select_extreme
 from gausslite_selection.supporting_surface import FloorLevel, SupportingSurfaces, level_under_m, nouns_known_by_height
 
@@ -59,9 +60,11 @@ class AttributeSelector(Selector):
         self._colours = ColourFilter(graph)
         self._surfaces = SupportingSurfaces(graph, nouns_known_by_height(matches), up)
         self._superlatives = {attributes.name: attributes.superlative for attributes in graph.attributes}
+        self._camera_m: Float64[ndarray, "3"] | None = None  # the latest, which sides are relative to
 
     def observe(self, frame: Frame) -> None:
         """Count the points of a frame by their height."""
+        self._camera_m = frame.T_world_camera[:3, 3]
         self._surfaces.observe(frame)
 
     def measured(self, observation: Observation, mask: Bool[ndarray, "h w"], frame: Frame) -> Attributes:
@@ -99,9 +102,10 @@ class AttributeSelector(Selector):
         return self._colours.label(name)
 
     def notes(self, confirmed: Sequence[Landmark], objects: TaskObjects) -> tuple[str, ...]:
-        """Return what colours and heights decided."""
+        """Return what colours and heights decided, and the relations that leave out every object of a target."""
         seen = [(landmark.phrase, attributes_of(landmark.measured).colours) for landmark in confirmed]
-        return (*self._colours.notes(seen), *self._height_notes(confirmed, objects))
+        left_out = filter(None, (self._left_out(target, confirmed, objects) for target in self._graph.targets))
+        return (*self._colours.notes(seen), *self._height_notes(confirmed, objects), *left_out)
 
     def state(self) -> State:
         """Return the counts of points by their height."""
@@ -120,6 +124,18 @@ class AttributeSelector(Selector):
         if len(levels_m) > _MAX_LEVELS or not np.isfinite(levels_m).all():
             raise MapFileError(f"state landmark: expected at most {_MAX_LEVELS} finite levels, got {len(levels_m)}")
         return Attributes(colours, levels_m)
+
+    def _left_out(self, target: str, confirmed: Sequence[Landmark], objects: TaskObjects) -> str | None:
+        own = [landmark for landmark in confirmed if landmark.phrase == noun_of(target)]
+        if any(landmark.is_given for landmark in own):
+            return None
+        seen = [
+            replace(landmark.seen_from(landmark.centroid_m), camera_m=self._camera_m)
+            for landmark in own
+            if self.fit(target, landmark.measured) is not Fit.NO
+            and not self.is_excluded(landmark.phrase, landmark.measured)
+        ]
+        return left_out_note(self._graph, target, seen, self, objects)
 
     def _stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
         return self._surfaces.stands_on(relation, seen.votes, attributes_of(seen.measured).levels_m)

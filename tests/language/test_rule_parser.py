@@ -377,6 +377,21 @@ def test_what_is_typed_in_a_hurry_is_read_with_a_warning(text, same, warning):
 
 
 @pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ("lost my vase lol chk the sofa", "Lost my vase. Check the sofa"),
+        ("map the desk real good rest dont care", "Map the desk"),
+        ("Pull the red jug apart from the blue jug", "Pull the red jug away from the blue jug"),
+        ("Which direction is the vase relative to me?", "Which direction is the vase from me?"),
+        ("grab the cup no just the plate", "Grab the cup, no, the plate"),
+        ("Collect tools, for example a hammer", "Collect tools, a hammer"),
+    ],
+)
+def test_what_strangers_say_is_read_as_the_plain_sentence(text, same):
+    assert RuleParser().parse(text).is_equivalent_to(RuleParser().parse(same))
+
+
+@pytest.mark.parametrize(
     ("text", "lost"),
     [
         ("There is a victim behind the wall. Go to the door.", ["victim", "wall"]),

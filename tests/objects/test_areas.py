@@ -126,3 +126,13 @@ def test_a_place_that_is_no_area_is_named_with_those_that_are(
     capsys.readouterr()
     main(["objects", str(run), "mugs in the garage"])
     assert "note: 'garage' is no named area; areas are 'kitchen'\n" in capsys.readouterr().out
+
+
+def test_an_area_that_leaves_out_what_a_question_means_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    box = {"centroid_m": [5.0, 5.0, 1.0], "min_m": [4.9, 4.9, 0.9], "max_m": [5.1, 5.1, 1.1]}
+    run = write_run(tmp_path / "run", objects=[{**MUG, **box}], up=[0.0, 0.0, 1.0])
+    assert main(["edit", str(run), "area", "kitchen", *SQUARE]) == 0
+    assert main(["objects", str(run), "mug in the kitchen"]) == 1
+    assert "1 seen, none in 'kitchen': the nearest is 5.0 m away" in capsys.readouterr().out

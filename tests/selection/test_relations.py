@@ -175,6 +175,36 @@ def test_scores_are_compared_only_among_objects_that_satisfy_the_relation():
         assert spatial.notes == notes
 
 
+@pytest.mark.parametrize(
+    ("relations", "note"),
+    [
+        ([Relation(Predicate.ON, "mug", "table")], "none on the 'table': the nearest is 1.4 m away"),
+        (
+            [Relation(Predicate.NEAR, "mug", "table", max_m=1.0)],
+            "none near the 'table', at most 1 m: the nearest is 1.4 m away",
+        ),
+        (
+            [Relation(Predicate.NEAR, "mug", "table", True, 1.0)],
+            "2 near the 'table', at least 1 m, which the task excludes",
+        ),
+        (
+            [Relation(Predicate.IN_FRONT_OF, "mug", "table"), Relation(Predicate.ON, "mug", "table", True)],
+            "none in front of the 'table': the nearest is 1.4 m away",
+        ),
+        ([Relation(Predicate.NEAR, "mug", "table", max_m=1.5)], None),
+        ([Relation(Predicate.ON, "mug", "shelf")], None),
+    ],
+)
+def test_relations_that_leave_out_every_object_are_named(relations: list[Relation], note: str | None) -> None:
+    spatial = objects_of(*relations)
+    mugs = [small_object("mug", x_m, -0.4, 0.1) for x_m in (2.0, 2.6)]
+    for time_ns in (0, 10**9):
+        spatial.observe([replace(each, time_ns=time_ns) for each in (TABLE, *mugs)])
+    named = [line.removeprefix("2 'mug' seen, ") for line in spatial.notes if " seen, " in line]
+    assert named == ([] if note is None else [note])
+    assert bool(spatial.selected()) is (note is None)
+
+
 @given(st.floats(0.7, 6.0), st.floats(0.3, 4.0), st.floats(0.0, 3.0))
 def test_distances_bound_near_and_negation_reverses_it(x_m, low_m, width_m):
     mug = small_object("mug", x_m + 0.6, 0.0, 0.0)  # x_m from the table's side

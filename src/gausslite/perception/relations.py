@@ -42,7 +42,7 @@ class RelationFilter:
 
     def __init__(self, graph: TaskGraph, objects: TaskObjects, selector: Selector) -> None:
         """Objects and selector are shared with their owner, which observes frames."""
-        self._conditions = {target: _conditions(graph, target) for target in graph.targets}
+        self._conditions = {target: conditions_of(graph, target) for target in graph.targets}
         self._objects = objects
         self._selector = selector
 
@@ -71,7 +71,7 @@ class RelationFilter:
         return not evaluated or any(evaluated)
 
 
-def _conditions(graph: TaskGraph, target: str) -> list[tuple[Relation, ...]]:
+def conditions_of(graph: TaskGraph, target: str) -> list[tuple[Relation, ...]]:
     """Return the relations of a target, one each; all the anchors of `between` form one condition."""
     conditions: dict[object, tuple[Relation, ...]] = {}
     for number, relation in enumerate(graph.relations):
