@@ -6,6 +6,7 @@ and later ones, until another edit undoes them.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ import numpy as np
 
 from gausslite.codec.json import object_as_json, object_from_json
 from gausslite.codec.state_file import write_atomic
-from gausslite.domain.checks import quote_name, require_name
+from gausslite.domain.checks import MAX_NAME_BYTES, quote_name, require_name
 from gausslite.domain.errors import CodecError, InvalidInputError, MapFileError
 from gausslite.domain.objects import ObjectLandmark, ObjectRole, TeamObject
 from gausslite.domain.voxels import AxisAlignedBox
@@ -68,10 +69,9 @@ class Edit:
         require_name("edit author", self.author)
         if not self.author:
             raise InvalidInputError("edit author: expected the name of who edits, got an empty one")
-        if self.kind in (EditKind.RENAME, EditKind.NOTE):
-            require_name(f"{self.kind} value", self.value)
-            if not self.value.strip():
-                raise InvalidInputError(f"{self.kind}: expected a text, got an empty one")
+        require_name(f"{self.kind} value", self.value)
+        if self.kind in (EditKind.RENAME, EditKind.NOTE) and not self.value.strip():
+            raise InvalidInputError(f"{self.kind}: expected a text, got an empty one")
         if self.kind is EditKind.SPLIT and self.target is not None and len(self.halves(self.target)) < 2:
             box = self.target.extent_m
             raise InvalidInputError(
@@ -141,18 +141,21 @@ def apply_edits(objects: Iterable[ObjectLandmark], edits: Sequence[Edit]) -> Edi
     for edit in effective(edits):
         assert edit.target is not None
         found = edit.concerned(left)
+        ids = {landmark.object_id for landmark in found}
         if edit.kind is EditKind.DELETE:
-            left = [landmark for landmark in left if landmark not in found]
+            left = [landmark for landmark in left if landmark.object_id not in ids]
         elif edit.kind is EditKind.RENAME:
-            left = [replace(mark, noun=edit.value) if mark in found else mark for mark in left]
+            left = [replace(mark, noun=edit.value) if mark.object_id in ids else mark for mark in left]
         elif edit.kind is EditKind.MERGE and edit.other is not None:
-            found += [mark for mark in left if mark not in found and _is_same(edit.other, mark)]
-            rest = [landmark for landmark in left if landmark not in found]
+            found += [mark for mark in left if mark.object_id not in ids and _is_same(edit.other, mark)]
+            ids |= {landmark.object_id for landmark in found}
+            rest = [landmark for landmark in left if landmark.object_id not in ids]
             left = [*rest, _merged(found)] if found else rest
             for landmark in found[:1]:
                 parts[landmark.object_id] = tuple(own for mark in found for own in parts[mark.object_id])
         elif edit.kind is EditKind.SPLIT:
-            for mark in found:
+            # one of several, or each edit could double them
+            for mark in found[:1]:
                 first, *others = edit.halves(mark)
                 others = [replace(half, object_id=_free_id(half, left, "-half")) for half in others]
                 left = [half for own in left for half in ((first, *others) if own is mark else (own,))]
@@ -287,6 +290,7 @@ def _merged(objects: Sequence[ObjectLandmark]) -> ObjectLandmark:
 
 def _free_id(landmark: ObjectLandmark, objects: Iterable[ObjectLandmark], suffix: str) -> str:
     taken, object_id = {other.object_id for other in objects}, landmark.object_id
-    while object_id in taken:
-        object_id += suffix
-    return object_id
+    name = object_id.partition(suffix)[0].encode()[: MAX_NAME_BYTES - 16].decode(errors="ignore")
+    numbers = itertools.count(2)
+    free = itertools.chain((object_id, f"{name}{suffix}"), (f"{name}{suffix}{number}" for number in numbers))
+    return next(name for name in free if name not in taken)

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import logging
 from collections.abc import Callable
-from threading import Lock
 from typing import Any, Protocol
 
 from gausslite.fusion.engine import FusionEngine
@@ -17,6 +15,7 @@ from gausslite.v1 import memory_service_pb2 as pb
 from gausslite.v1 import memory_service_pb2_grpc as pb_grpc
 from gausslite.wire.security import Caller
 from gausslite.wire.server import Service
+from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server.plugins import FindEngine
 from gausslite_objects.areas import Area, decode_areas, encode_areas, with_area, without_area
 from gausslite_objects.edits import Edit, EditedObjects, apply_edits, decode_edits, encode_edits
@@ -72,43 +71,42 @@ def service_of(place: FindPlace) -> Service:
 
 
 class MemoryServicer(pb_grpc.MemoryServiceServicer):
-    """Edits objects as the caller; the work runs in threads, one change at a time."""
+    """Edits objects as the caller; the work runs in a thread, in fair turns between the callers."""
 
     def __init__(self, place: FindPlace) -> None:
         self._place = place
-        self._changing = Lock()
+        # one thread: an edit follows the edits before it
+        self._work = WorkerPool("memory")
 
     async def EditObject(self, request: pb.EditObjectRequest, context: Any) -> pb.EditObjectResponse:
         """Correct an object."""
         caller = Caller.of(context)
         author = (request.author or caller.host) if caller.names is None else caller.key
-        entry = await asyncio.to_thread(self._edit, request, author)
+        entry = await self._work.run(context, self._edit, request, author)
         _log.info("objects: %s", entry.describe())
         return pb.EditObjectResponse(edit=entry_to_message(entry))
 
-    async def SetArea(self, request: pb.SetAreaRequest, _context: Any) -> pb.SetAreaResponse:
+    async def SetArea(self, request: pb.SetAreaRequest, context: Any) -> pb.SetAreaResponse:
         """Add, replace or remove an area."""
-        await asyncio.to_thread(self._set_area, request)
+        await self._work.run(context, self._set_area, request)
         return pb.SetAreaResponse()
 
-    async def GetMemory(self, request: pb.GetMemoryRequest, _context: Any) -> pb.GetMemoryResponse:
+    async def GetMemory(self, request: pb.GetMemoryRequest, context: Any) -> pb.GetMemoryResponse:
         """Return edits, areas, and what people said of each object."""
-        return await asyncio.to_thread(self._read, request)
+        return await self._work.run(context, self._read, request)
 
     def _edit(self, request: pb.EditObjectRequest, author: str) -> EditEntry:
         place, kind = self._place(request.mission_id), kind_from_number(request.kind)
-        with self._changing:
-            edits = place.edits()
-            made = new_edit(edits, place.objects().objects, kind, request.object_id, request.value, author)
-            place.save_edits((*edits, made))
+        edits = place.edits()
+        made = new_edit(edits, place.objects().objects, kind, request.object_id, request.value, author)
+        place.save_edits((*edits, made))
         return EditEntry.of(len(edits) + 1, made)
 
     def _set_area(self, request: pb.SetAreaRequest) -> None:
         place, area = self._place(request.mission_id), request.area
-        with self._changing:
-            areas = place.areas()
-            changed = with_area(areas, area_from_message(area)) if area.corners_m else without_area(areas, area.name)
-            place.save_areas(changed)
+        areas = place.areas()
+        changed = with_area(areas, area_from_message(area)) if area.corners_m else without_area(areas, area.name)
+        place.save_areas(changed)
 
     def _read(self, request: pb.GetMemoryRequest) -> pb.GetMemoryResponse:
         place = self._place(request.mission_id)

@@ -18,6 +18,7 @@ from gausslite_objects.areas import Area, read_areas, with_area, without_area, w
 from gausslite_objects.edits import Edit, EditKind, apply_edits, read_edits, require_near, require_room, write_edits
 
 _NEEDS_VALUE = (EditKind.RENAME, EditKind.MERGE, EditKind.NOTE)
+_MAX_DIGITS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ def new_edit(
     now_ns = time.time_ns()
     if kind is EditKind.UNDO:
         number = object_id or value
-        if not (number.isdecimal() and 1 <= int(number) <= len(edits)):
+        if not (number.isdecimal() and len(number) < _MAX_DIGITS and 1 <= int(number) <= len(edits)):
             raise InvalidInputError(
                 f"undo: expected the number of an edit, 1 to {len(edits)}, got {quote_name(number)}"
             )

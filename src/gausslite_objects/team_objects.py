@@ -36,7 +36,7 @@ from gausslite.domain.task import noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.store import FusionStore
 from gausslite.nouns import same_kind
-from gausslite_objects.edits import Edit, apply_edits, decode_edits, edit_team
+from gausslite_objects.edits import decode_edits, edit_team
 
 _MIN_MATCH_DISTANCE_M = 0.15
 _MATCH_DISTANCE_SHARE = 0.5
@@ -309,9 +309,9 @@ class MergedObjects:
     def __init__(self, store: FusionStore) -> None:
         """The store keeps the objects' ids and edits. edited: what people said of the objects that were found last."""
         self._ids, self._store = TeamObjectIds(store), store
-        self._edits: tuple[bytes, tuple[Edit, ...]] = b"", ()
-        self.edited = apply_edits((), ())
-        # held while reports are merged, so that many queries at once merge once
+        self._objects, self.edited = edit_team((), ())
+        self._edited_of: tuple[bytes, tuple[TeamObject, ...]] = b"", ()
+        # held while reports are merged and edited, so that many queries at once do it once
         self._lock = Lock()
         self._of: tuple[dict[str, ObjectReport], dict[str, bytes]] = {}, {}
         self._merged: tuple[TeamObject, ...] = ()
@@ -336,10 +336,12 @@ class MergedObjects:
         self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]], noun: str
     ) -> tuple[TeamObject, ...]:
         """Return those of `of` that a noun names, or all, after the edits in the store. Raises InvalidInputError."""
-        data = self._store.find_record("", EDITS_RECORD)
-        if data != self._edits[0]:
-            self._edits = data, decode_edits(data)
-        objects, self.edited = edit_team(self.of(reports, frames), self._edits[1])
+        of = self._store.find_record("", EDITS_RECORD), self.of(reports, frames)
+        with self._lock:
+            if of != self._edited_of:
+                self._objects, self.edited = edit_team(of[1], decode_edits(of[0]))
+                self._edited_of = of
+            objects = self._objects
         return find_objects(objects, noun)
 
 

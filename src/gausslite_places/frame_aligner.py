@@ -14,7 +14,7 @@ from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.alignment import FrameDecisions, TeamView
-from gausslite.fusion.epochs import agent_of
+from gausslite.fusion.epochs import agent_of, is_former
 from gausslite.fusion.frames import FrameAlignment, FrameFit
 from gausslite_places.fit_process import FitProcess
 from gausslite_places.frame_fit import MIN_SAMPLES, Fit, SurfaceSamples, fit_frame
@@ -111,7 +111,7 @@ class MapAligner:
         """Search unknown frames, compare the agents with enough new data, then decide; see FrameAligner."""
         frames, failure, deleted = _Frames(team), "", []
         self._take_news(team)
-        for name, alignment in self._unknown_frames.search(team, frames).items():
+        for name, alignment in self._unknown_frames.search(team, frames, at_most).items():
             if alignment.is_localised:
                 self._change_frame(name, alignment)
             if alignment.is_localised or alignment.message != frames[name].message:
@@ -127,7 +127,7 @@ class MapAligner:
         return FrameDecisions(
             {name: frames[name] for name in frames if name in frames.decided},
             tuple(deleted),
-            bool(self._due(team, frames)),
+            bool(self._due(team, frames)) or self._unknown_frames.is_due,
             failure,
         )
 
@@ -137,13 +137,14 @@ class MapAligner:
         for agent_id, own in news.items():
             if own.is_deleted:
                 self._delete(agent_id)
-            if own.keys:
-                if agent_id not in self._maps:
-                    self._add(agent_id, team)
+            if own.keys and agent_id in self._maps:
                 self._maps[agent_id].unread |= own.keys
                 self._maps[agent_id].changed += own.changed
                 self._maps[agent_id].is_new = True
+        stored = team.store.agents()
         for agent_id, (frame_id, alignment) in team.frames.items():
+            if agent_id in stored and agent_id not in self._maps:
+                self._add(agent_id, team)
             known = self._maps.get(agent_id)
             if known is not None and known.frame_id != frame_id:
                 if known.frame_id:
@@ -151,10 +152,11 @@ class MapAligner:
                 known.frame_id = frame_id
 
     def _add(self, agent_id: str, team: TeamView) -> None:
-        """Add an agent's map: empty, or after a restart."""
-        own = self._maps[agent_id] = _AgentMap()
+        """Add a map that is new here, or under its name."""
+        unread = set(team.store.keys(agent_id).tolist())
+        own = self._maps[agent_id] = _AgentMap(unread=unread, changed=len(unread), is_new=True)
         if agent_id in team.frames and team.frames[agent_id][1].segments:
-            own.first_seq = team.totals(agent_id).highest_update_seq + 1
+            own.first_seq = team.store.totals(agent_id).highest_update_seq + 1
 
     def _delete(self, agent_id: str) -> None:
         self._maps.pop(agent_id, None)
@@ -183,7 +185,7 @@ class MapAligner:
         due = [
             name
             for name, own in self._maps.items()
-            if own.changed >= max(1, _REFIT_SHARE * team.totals(name).voxels)
+            if own.changed >= max(1, _REFIT_SHARE * team.store.totals(name).voxels)
             and name in frames
             and frames[name].is_localised
         ]
@@ -194,7 +196,7 @@ class MapAligner:
         own, alignment = self._maps[agent_id], frames[agent_id]
         self._compared += 1
         own.compared = self._compared
-        highest_seq = team.totals(agent_id).highest_update_seq
+        highest_seq = team.store.totals(agent_id).highest_update_seq
         changed, own.changed = own.changed, 0
         try:
             self._read(agent_id, team)
@@ -267,7 +269,9 @@ class MapAligner:
             return
         pair, is_new = frozenset((agent_id, name)), self._maps[agent_id].is_new
         before = self._comparisons.get(pair, Comparison(fit, 0))
-        agrees = agree_as_declared(fit, frames[agent_id], frames[name], source.points_m.mean(axis=0), before.agrees)
+        middle_m = source.points_m.mean(axis=0)
+        agrees = agree_as_declared(fit, frames[agent_id], frames[name], middle_m, before.agrees)
+        agrees &= not fit.looks_different
         now = self._comparisons[pair] = Comparison(fit, self._compared, agrees)
         # new data of either side count against a frame that the server has found
         members = {agent_id, *(member for member in pair if frames[member].is_unknown)}
@@ -295,6 +299,7 @@ class MapAligner:
             self._delete(outdated[0])
             frames.decided.discard(outdated[0])
         self._follow(majority, frames)
+        verified = self._verified([name for name in majority.supporters if name not in quarantined])
         has_reference = False
         for name in majority.supporters:
             before = frames[name]
@@ -304,7 +309,8 @@ class MapAligner:
                 continue
             is_first = not has_reference and not before.segments
             is_even = any(majority.is_even(name, other) for other in against)
-            after = in_state(before, against, name in quarantined, is_first, is_even)
+            doubt = "" if name in verified else self._doubt(name, verified)
+            after = in_state(before, against, name in quarantined, is_first, is_even, doubt)
             has_reference |= after.is_used and not after.segments
             if (after.state, after.message, after.against) != (before.state, before.message, before.against):
                 frames.decide(name, after)
@@ -328,6 +334,26 @@ class MapAligner:
                 if is_led and self._maps[name].compared < found.number:
                     self._compare_again(name, frames[name])
 
+    def _verified(self, used: Sequence[str]) -> list[str]:
+        """Return the largest group of agents, or the first of equal ones, whose maps agree with another one's in it."""
+        groups: list[list[str]] = []
+        for first in used:
+            group = [] if any(first in other for other in groups) else [first]
+            for name in group:  # it grows
+                pairs = {other: self._comparisons.get(frozenset((name, other))) for other in used if other not in group}
+                group += [other for other, found in pairs.items() if found is not None and found.shows_the_same_place]
+            groups.append(group)
+        return max(groups, key=len, default=[])
+
+    def _doubt(self, agent_id: str, verified: Sequence[str]) -> str:
+        """Return why nothing shows that the agent's frame is that of these ones."""
+        if not self._maps[agent_id].compared:
+            return "frame: not verified yet"
+        others = [name for name in verified if not is_former(name) and name != agent_of(agent_id)]
+        if shared := [name for name in others if frozenset((agent_id, name)) in self._comparisons]:
+            return f"frame: not verified: what it shares with {_listed(shared)} does not tell whether it is one place"
+        return f"frame: not verified: it shares no place with {_listed(others) or 'others'}"
+
     def _contradictions(self, agent_id: str, majority: Majority, quarantined: Collection[str]) -> dict[str, FrameFit]:
         """Return the fits of the used agents that this one contradicts, or differs from while neither leads."""
         return {
@@ -339,6 +365,11 @@ class MapAligner:
             and name in majority.supporters
             and (comparison.contradicting or (corrects(comparison.fit) and majority.is_even(agent_id, name)))
         }
+
+
+def _listed(names: Collection[str]) -> str:
+    first = ", ".join([*names][:_MAX_WITNESSES])
+    return f"{first} and {len(names) - _MAX_WITNESSES} more" if len(names) > _MAX_WITNESSES else first
 
 
 def _counted(before: Mapping[str, int], members: Collection[str], is_new: bool) -> dict[str, int]:

@@ -25,9 +25,8 @@ WITNESSES = 2
 
 def contradicts(fit: FrameFit) -> bool:
     """Return whether no allowed correction explains the misfit."""
-    if fit.is_better:
-        return fit.shift_m > MAX_SHIFT_M or fit.rotation_deg > MAX_ROTATION_DEG
-    return fit.is_apart
+    is_far = fit.shift_m > MAX_SHIFT_M or fit.rotation_deg > MAX_ROTATION_DEG
+    return fit.looks_different or (is_far if fit.is_better else fit.is_apart)
 
 
 def corrects(fit: FrameFit) -> bool:
@@ -66,6 +65,11 @@ class Comparison:
     agrees: bool = False
     contradicting: dict[str, int] = field(default_factory=dict)
     agreeing: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def shows_the_same_place(self) -> bool:
+        """Return whether it is certain that the two see one place, as they are or after the fit's motion."""
+        return self.agrees or (self.fit.is_sure and not contradicts(self.fit))
 
 
 class Majority:
@@ -150,10 +154,12 @@ def in_state(
     is_quarantined: bool,
     is_first: bool,
     is_even: bool = False,
+    doubt: str = "",
 ) -> FrameAlignment:
     """Return the alignment in the state that follows from its contradictions.
 
     is_first: no other defines a frame. is_even: as many agents agree with it as with those that it contradicts.
+    doubt: why no comparison shows that its frame is the team's; empty if one does.
     """
     if is_quarantined and before.is_unknown:
         return before.unlocalised(f"its former place contradicts {', '.join(against)}")
@@ -161,10 +167,13 @@ def in_state(
     if against:
         name, last = next(iter(against.items()))
         misfit = f"its surfaces are {1e3 * last.before.distance_m:.0f} mm away"
-        motion = f"{last.shift_m:.2f} m and {last.rotation_deg:.0f} deg would fit better"
+        if last.is_better:
+            misfit = f"{last.shift_m:.2f} m and {last.rotation_deg:.0f} deg would fit better"
+        if last.looks_different:
+            misfit = "its surfaces look different, as those of another place"
         message = (
-            f"frame: contradicts {', '.join(against)}: {motion if last.is_better else misfit} ({name}); check the "
-            f"agent's localisation, or declare its frame with fused-from-agent"
+            f"frame: contradicts {', '.join(against)}: {misfit} ({name}); check the "
+            f"agent's localisation, or declare its frame with fused-from-agent; another place needs a server of its own"
             f"{_EVEN if is_even else ''}"
         )
     if is_quarantined:
@@ -178,7 +187,8 @@ def in_state(
         found = "frame unknown: found by the server" if before.is_unknown else "frame: corrected"
         message = message or f"{found}; {_size(before)} in all"
     else:
-        state = AlignmentState.UNKNOWN if last is None or against else AlignmentState.ALIGNED
+        state = AlignmentState.UNKNOWN if doubt or against else AlignmentState.ALIGNED
+        message = message or doubt
     return replace(before, state=state, message=message, against=tuple(against), fit=last)
 
 

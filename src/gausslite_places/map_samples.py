@@ -47,7 +47,8 @@ class MapSamples:
         """Replace the samples of these voxels by those of the agent's newest updates. Raises StorageError."""
         for start in range(0, len(keys), _SLICE_VOXELS):
             part = keys[start : start + _SLICE_VOXELS]
-            self._put(part, *team.voxels(agent_id, part))
+            batch = team.store.batch(agent_id, part)
+            self._put(part, batch, team.store.scores_of(agent_id, batch.keys)["update_seqs"])
 
     def in_frame(self, alignment: FrameAlignment, first_seq: int = 0) -> SurfaceSamples:
         """Return the samples of the updates from first_seq on in the fused frame; all if these are few."""
@@ -83,7 +84,7 @@ def thinned_samples(team: TeamView, agent_id: str, alignment: FrameAlignment) ->
 
     The blocks of maps in different frames never coincide, so single voxels are chosen. Raises StorageError.
     """
-    keys = team.keys(agent_id)
+    keys = team.store.keys(agent_id)
     whole = MapSamples()
     whole.read(team, agent_id, np.sort(keys[np.argsort(hash_columns(keys), kind="stable")[:_MAX_THINNED_VOXELS]]))
     return whole.in_frame(alignment)

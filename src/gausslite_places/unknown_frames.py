@@ -8,11 +8,11 @@ fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import back_project
@@ -26,6 +26,7 @@ from gausslite_places.frame_fit import (
     LUMINANCE,
     SurfaceSamples,
     TargetSurface,
+    block_correlation,
     blocks_of,
     evaluate_motion,
     in_shared_cubes,
@@ -48,7 +49,6 @@ right ones of at least 0.39."""
 _OTHER_MATCHED, _OTHER_TEXTURE, _OTHER_BLOCKS = 0.9, 0.7, 15
 """Shares of the best motion's figures, and blocks, with which another motion is as good."""
 _APART_M, _APART_DEG = 0.25, 8.0
-_MIN_BLOCK_SAMPLES = 4
 _MAX_KEYFRAMES = 24
 _SAMPLE_GRID = VoxelGrid(0.05)
 _NEAREST_M, _FARTHEST_M, _STEP_PX, _DEPTH_EDGE_PX = 0.1, 5.0, 2, 2
@@ -192,7 +192,7 @@ class _Search:
             overlap=float(shared.sum() / self._is_held_out.sum()),
             blocks=occupied_blocks(blocks),
             matched=float(matched.mean()),
-            texture=_block_correlation(samples.luminance[matched], theirs[matched], blocks[matched]),
+            texture=block_correlation(samples.luminance[matched], theirs[matched], blocks[matched]),
         )
 
     def excels(self, motion: Float64[ndarray, "4 4"], other: Float64[ndarray, "4 4"]) -> bool:
@@ -223,20 +223,6 @@ class _Search:
         return orthonormal(self._places.surface.refined(surface, T, *reaches_m))
 
 
-def _block_correlation(
-    one: Float64[ndarray, " n"], other: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]
-) -> float:
-    """Return the correlation of two values about their means in each block with enough of them; 0 without any."""
-    _, of_sample, counts = np.unique(blocks, return_inverse=True, return_counts=True)
-    used = (counts >= _MIN_BLOCK_SAMPLES)[of_sample]
-    first, second = (
-        (values - (np.bincount(of_sample, values, len(counts)) / np.maximum(counts, 1))[of_sample])[used]
-        for values in (one, other)
-    )
-    spread = float(np.sqrt(np.square(first).sum() * np.square(second).sum()))
-    return float(first @ second) / spread if spread > 0 else 0.0
-
-
 def keyframe_samples(frame: Frame) -> SurfaceSamples:
     """Return a sample for each cube of 5 cm that the depth of a keyframe shows, in the frame of its pose."""
     depth_m = without_depth_edges(frame.depth_m, _DEPTH_EDGE_PX)
@@ -263,16 +249,21 @@ class UnknownFrames:
 
     def __init__(self, find: Find) -> None:
         self._find = find
+        self.is_due = False
+        """Whether more agents wait for a search."""
         # the team at the latest search, the agent's size and the team's
         self._searched: dict[str, tuple[tuple[str, ...], tuple[int, int]]] = {}
         self._failed: dict[str, int] = {}
         # of each agent, by the ids of its keyframes
         self._samples_of_keyframe: dict[str, dict[int, SurfaceSamples]] = {}
 
-    def search(self, team: TeamView, frames: Mapping[str, FrameAlignment]) -> dict[str, FrameAlignment]:
+    def search(
+        self, team: TeamView, frames: Mapping[str, FrameAlignment], at_most: int | None = None
+    ) -> dict[str, FrameAlignment]:
         """Search the frames of the agents with enough new data; returns their new alignments.
 
-        frames: of all agents, by rank.
+        frames: of all agents, by rank. at_most: number of searches, those first whose latest one is the oldest: one
+        takes seconds, and many names could keep the others from being compared.
         """
         names = [name for name in frames if _size(team, name)]
         for known in (self._searched, self._failed, self._samples_of_keyframe):
@@ -285,19 +276,24 @@ class UnknownFrames:
             # nobody knows a frame: the first agent's is as good as any
             first = waiting.pop(0)
             found[first] = localised[first] = in_state(frames[first], {}, is_quarantined=False, is_first=True)
-        for name in waiting:
-            if self._is_due(team, name, tuple(localised)):
-                found[name] = self._search(team, name, frames[name], localised)
+        order = [*self._searched]
+        due = [name for name in waiting if self._is_due(team, name, tuple(localised))]
+        due.sort(key=lambda name: order.index(name) if name in order else -1)
+        self.is_due = len(due[:at_most]) < len(due)
+        for name in due[:at_most]:
+            self._searched.pop(name, None)
+            self._searched[name] = tuple(localised), self._sizes(team, name, localised)
+            found[name] = self._search(team, name, frames[name], localised)
         return found
 
     def _is_due(self, team: TeamView, agent_id: str, localised: tuple[str, ...]) -> bool:
-        sizes = _size(team, agent_id), sum(_size(team, name) for name in localised)
+        sizes = self._sizes(team, agent_id, localised)
         last, last_sizes = self._searched.get(agent_id, ((), sizes))
         has_grown = any(now >= _GROWTH * then for now, then in zip(sizes, last_sizes, strict=True))
-        is_due = last != localised or has_grown
-        if is_due:
-            self._searched[agent_id] = localised, sizes
-        return is_due
+        return last != localised or has_grown
+
+    def _sizes(self, team: TeamView, agent_id: str, localised: Iterable[str]) -> tuple[int, int]:
+        return _size(team, agent_id), sum(_size(team, name) for name in localised)
 
     def _search(
         self, team: TeamView, agent_id: str, unknown: FrameAlignment, localised: Mapping[str, FrameAlignment]
@@ -321,15 +317,15 @@ class UnknownFrames:
 
     def _samples(self, team: TeamView, agent_id: str, alignment: FrameAlignment) -> SurfaceSamples:
         """Return samples of the agent's voxels and keyframes, in the fused frame if the agent is localised."""
-        ids = team.keyframe_ids(agent_id)
+        ids = team.keyframes.ids(agent_id)
         chosen = list(ids)[:: max(1, -(-len(ids) // _MAX_KEYFRAMES))]
         # one that was received again is read again
         before = self._samples_of_keyframe.get(agent_id, {})
         samples = {ids[index]: before[ids[index]] for index in chosen if ids[index] in before}
         for index in chosen:
-            frame = None if ids[index] in samples else team.keyframe(agent_id, index)
-            if frame is not None:
-                samples[ids[index]] = keyframe_samples(frame)
+            if ids[index] not in samples:
+                for found in team.keyframes.decode(team.keyframes.read([(agent_id, index)])):
+                    samples[ids[index]] = keyframe_samples(found.frame)
         self._samples_of_keyframe[agent_id] = samples
         seen = _one_of_each_cube(SurfaceSamples.concatenate([*samples.values()])).moved(alignment.T_fused_agent)
         return SurfaceSamples.concatenate([thinned_samples(team, agent_id, alignment), seen])
@@ -337,4 +333,4 @@ class UnknownFrames:
 
 def _size(team: TeamView, agent_id: str) -> int:
     """Return a measure of what the server has of an agent's surfaces."""
-    return team.totals(agent_id).voxels + _KEYFRAME_VOXELS * len(team.keyframe_ids(agent_id))
+    return team.store.totals(agent_id).voxels + _KEYFRAME_VOXELS * len(team.keyframes.ids(agent_id))

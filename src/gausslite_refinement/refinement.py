@@ -14,7 +14,7 @@ from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.fusion.refinement import RefineInput, RefineProgress, RefineSettings
+from gausslite.fusion.refinement import RefineProgress, RefineSettings
 from gausslite.mapping.settings import BALANCED_LOSS, ONLINE_RATES
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.rasterizer import (
@@ -24,6 +24,7 @@ from gausslite.render.rasterizer import (
     UpdateCounter,
     rows_to_gaussians,
 )
+from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.views import BACKGROUND, RefineView, agreeing, views_of
 
 _Rows = Float32[ndarray, "n 16"]

@@ -15,6 +15,7 @@ from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
 from gausslite.wire.views import ChangeNotifier
+from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.refinement import Refinement
 
 _log = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ class RefinementWorker:
             progress_notifier.notify()
 
         def work() -> None:
-            vote = engine.refinement_input()
+            vote = RefineInput.of(engine)
             refinement = Refinement(vote, self._create_rasterizer(), settings)
             for line in refinement.left_out:
                 _log.warning("refinement: left out, because they disagree with the vote: %s", line)

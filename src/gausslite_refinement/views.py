@@ -17,9 +17,9 @@ from numpy import ndarray
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.fusion.refinement import RefineInput
 from gausslite.mapping.window_view import roi_weights
 from gausslite.render.rasterizer import FULL_FRAME, Rasterizer, Subset, TrainingView
+from gausslite_refinement.refine_input import RefineInput
 
 _FOOTPRINT_ALPHA = 0.5
 _DEPTH_M, _DEPTH_SHARE, _COLOUR = 0.05, 0.05, 0.1

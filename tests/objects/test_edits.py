@@ -12,6 +12,7 @@ from gausslite.cli.main import main
 from gausslite.codec.json import object_as_json, object_from_json
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import transform_of
+from gausslite.domain.voxels import AxisAlignedBox
 from gausslite_objects.edits import CARRIED, Edit, EditedObjects, EditKind, apply_edits, edits_as_json, read_edits
 
 FOUND = object_from_json(MUG)
@@ -90,6 +91,16 @@ def test_a_split_object_is_two_also_when_it_is_found_again(run: Path) -> None:
     assert _edited(run, left, right).objects == (left, right)
 
 
+def test_objects_that_are_split_again_and_again_stay_few_and_have_names(run: Path) -> None:
+    large = replace(FOUND, noun="m" * 200, extent_m=AxisAlignedBox((0.0,) * 3, (9.0,) * 3), centroid_m=(4.5,) * 3)
+    cuts = [Edit(EditKind.SPLIT, "ann", 1, large, f"{axis}={at / 10}") for axis in "xyz" for at in range(1, 85)]
+    # of another id now, and with names as long as they may be
+    for object_id in ("mug-7", "é" * 127):
+        edited = apply_edits([replace(large, object_id=object_id)], cuts)
+        assert len(edited.objects) <= 1 + len(cuts)
+        assert len({found.object_id for found in edited.objects}) == len(edited.objects)
+
+
 def test_a_run_that_continues_an_edited_map_carries_its_edits(run: Path, tmp_path: Path) -> None:
     _edit(run, "delete", FOUND.object_id)
     following = write_run(tmp_path / "next", **{CARRIED: edits_as_json(read_edits(run))})
@@ -106,6 +117,8 @@ def test_a_run_that_continues_an_edited_map_carries_its_edits(run: Path, tmp_pat
         (("rename", FOUND.object_id, " "), "rename: expected a text"),
         (("merge", FOUND.object_id, "sofa-1"), "object: expected one of"),
         (("undo", "1"), "undo: expected the number of an edit, 1 to 0"),
+        (("undo", "9" * 5000), "undo: expected the number of an edit, 1 to 0"),
+        (("delete", FOUND.object_id, "x" * 300), "delete value: expected at most 255 bytes, got 300"),
         (("split", FOUND.object_id, "x=99"), "expected a place inside its box"),
         (("split", FOUND.object_id, "w=1"), "split: expected an axis and a place in metres, as x=1.25"),
     ],

@@ -1,12 +1,15 @@
 """MemoryService: edits and areas of a team are durable, attributed, undoable, and made by operators."""
 
+import asyncio
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import pytest
 from certificates import identity, make_certificates
 from fusion_running import GRAPH, GRID, MUG, fusion_server
+from waiting import wait_until
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError, MismatchError, NotPermittedError
@@ -126,3 +129,23 @@ def test_operators_edit_under_the_names_of_their_certificates_and_viewers_read(t
             assert (len(memory.edits()), memory.areas()) == (1, (HALL,))
             for change in (lambda: memory.edit(EditKind.DELETE, ID), lambda: memory.remove_area("hall")):  # noqa: B023
                 pytest.raises(NotPermittedError, change).match("one of the roles operator")
+
+
+def test_a_flood_of_readings_is_refused_by_name_and_leaves_the_threads_of_others_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with fusion_server() as server:
+        store, may_end = server.servicer.engine.store, Event()
+        find = store.find_record
+        monkeypatch.setattr(store, "find_record", lambda *names: may_end.wait(60) and find(*names))
+        stub = pb_grpc.MemoryServiceStub(server.channel)
+        calls = [stub.GetMemory.future(pb.GetMemoryRequest(), timeout=60) for _ in range(80)]
+        try:
+            wait_until(lambda: sum(call.done() for call in calls) == 80 - 65)
+            # the event loop's own threads check the disk
+            busy = asyncio.run_coroutine_threadsafe(asyncio.to_thread(int), server.loop)
+            assert busy.result(20) == 0
+        finally:
+            may_end.set()
+        for refused in (call for call in calls if call.exception()):
+            assert "memory: expected at most 64 calls that wait" in refused.details()

@@ -305,11 +305,15 @@ def test_moved_voxels_are_those_of_a_new_engine_whatever_the_order_of_messages(s
     for seq in range(1, 9):
         if rng.random() < 0.4:
             engine.declare_frame("bee", wrong_frame(tuple(rng.uniform(-0.5, 0.5, 3)), rng.uniform(0, 90)))
+        for _ in range(int(rng.integers(0, 3))):
+            engine.work_in_background()
         points = rng.uniform(0, rng.choice([0.3, 1.0]), (int(rng.integers(1, 80)), 3))
         batch = group_by_voxel(plain_gaussians(points, kappa=int(rng.integers(1, 12))), GRID)
         gone = tombstones(np.setdiff1d(store.batch("bee").keys, batch.keys)[: int(rng.integers(0, 4))])
         session = engine.join("bee", ANYTHING).session.session_id
         engine.contribute(session, RoiSubset("bee", "", seq, seq, merge_batches(batch, gone)), GRID)
+    while engine.has_background_work:
+        engine.work_in_background()
     again = aligning(store)
     for read in (lambda e: e.maps.voted_map(), lambda e: e.maps.union_map(), lambda e: e.maps.changes().won.batch):
         ours, theirs = read(engine), read(again)

@@ -221,6 +221,8 @@ def test_an_agent_that_knows_its_frame_now_is_used_as_sent() -> None:
     assert "frame-alignment = trust" in alignment_of(engine, "ant").message
     assert won(engine, "ant") == 0
     engine.declare_frame("ant", np.eye(4))
+    while engine.has_background_work:
+        engine.work_in_background()
     assert won(engine, "ant") == len(group_by_voxel(scan(0), GRID))
 
 
@@ -294,3 +296,21 @@ def test_a_slow_disk_delays_nobody_while_keyframes_are_read(monkeypatch: pytest.
         finally:
             released.set()
         run.result(60)
+
+
+def test_many_names_in_unknown_frames_are_searched_in_turns() -> None:
+    searched: list[int] = []
+    engine = aligning(find=lambda source, _: searched.append(len(source)) or FrameSearch(None, "no overlap found"))
+    send(engine, "ant", scan(0))
+    for number in range(1, 4):
+        send(engine, f"lost-{number}", scan(number).take(np.arange(1000 * number)), unknown=True)
+    runs = [engine.align_due(at_most=1) for _ in range(4)]
+    assert [run.is_due for run in runs] == [True, True, False, False]
+    assert sorted(searched) == searched
+    assert len(searched) == 3
+    # others were compared meanwhile, and the one whose search is the oldest comes first
+    send(engine, "ant", scan(4), seq=2)
+    for number in (2, 1):
+        send(engine, f"lost-{number}", scan(number), seq=2)
+        engine.align_due(at_most=1)
+    assert len(searched) == 5

@@ -2,7 +2,10 @@
 
 import dataclasses
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +20,12 @@ from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.keyframe_pool import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
 from gausslite.fusion.limits import Quotas
-from gausslite.fusion.refinement import RefineInput, RefineProgress, RefineSettings
+from gausslite.fusion.refinement import RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rasterizer, gaussians_to_rows
 from gausslite.wire.convert import decode_frame
+from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.refinement import Refinement
 
 CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)
@@ -155,7 +159,7 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     names = pool.names()
     assert pool.read(names) == [("ant", b"2"), ("ant", b"again")]
     assert names == [("aardvark", 7), ("ant", 2), ("ant", 3)]
-    assert (len(pool), pool.count("ant"), pool.indices("ant"), pool.count("bee")) == (3, 2, (2, 3), 0)
+    assert (len(pool), pool.indices("ant"), pool.indices("bee")) == (3, (2, 3), ())
     # the store keeps them for the next process
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
     pool.begin_map("ant", store.begin_map("ant"))
@@ -210,6 +214,29 @@ def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> 
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
     with pytest.raises(QuotaError, match="keyframe 4: expected at most 10 bytes, got 11"):
         KeyframePool(store, limits).add(encoded("ant", 4, b"x" * 11))
+
+
+def test_a_new_map_waits_for_no_keyframe_that_is_written_with_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    store, begun, may_end = SqliteStore(), Event(), Event()
+    pool, save = KeyframePool(store, Quotas()), store.save_keyframe
+    pool.add(encoded("ant", 1, b"1"))
+
+    def save_slowly(*arguments: Any) -> None:
+        save(*arguments)
+        begun.set()
+        assert may_end.wait(60)
+
+    monkeypatch.setattr(store, "save_keyframe", save_slowly)
+    with ThreadPoolExecutor(1) as threads:
+        writing = threads.submit(pool.add, encoded("ant", 2, b"2"))
+        assert begun.wait(60)
+        pool.begin_map("ant", store.begin_map("ant"))
+        assert pool.remove_next()
+        may_end.set()
+        writing.result(60)
+    # it belongs to the former map, too
+    assert (pool.names(), pool.remove_next(), pool.remove_next()) == ([], True, False)
+    assert store.keyframe_sizes() == {}
 
 
 def test_keyframes_that_are_not_selected_are_deleted() -> None:

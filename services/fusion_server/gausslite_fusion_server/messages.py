@@ -153,13 +153,10 @@ def layer_from_message(number: int) -> MapLayer:
 def declare_frame(engine: FusionEngine, request: pb.JoinSessionRequest) -> None:
     """Set what an agent says of its frame. Raises PoseError, InvalidInputError, StorageError."""
     T_fused_agent = declared_frame_from_message(request)
-    if request.frame_is_unknown:
-        engine.declare_frame(request.agent_id, None)
-    elif T_fused_agent is not None:
+    if T_fused_agent is None and not request.frame_is_unknown and engine.frames.get(request.agent_id).is_unknown:
+        T_fused_agent = np.eye(4)  # it knows its frame now
+    if T_fused_agent is not None or request.frame_is_unknown:
         engine.declare_frame(request.agent_id, T_fused_agent)
-    elif engine.frames.get(request.agent_id).is_unknown:
-        # it knows its frame now
-        engine.declare_frame(request.agent_id, np.eye(4))
 
 
 def declared_frame_from_message(request: pb.JoinSessionRequest) -> Float64[ndarray, "4 4"] | None:

@@ -15,7 +15,7 @@ from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.engine import AlignmentRun, FusionEngine
+from gausslite.fusion.engine import FusionEngine, WorkDone
 from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.refinement import CreateRasterizer, RefineSettings
 from gausslite.plugins import Group, load
@@ -43,11 +43,9 @@ _KEYFRAME_PAUSE = 2.0
 """Pause after a keyframe is stored, in the time that storing took."""
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
-_ALIGN_PAUSE = 4.0
-"""Shortest pause after a comparison of an agent, in its durations: all together take a fifth of a core at most."""
-_ALIGN_RETRY_S = 30.0
-_SLICE_PAUSE = 4.0
-"""Pause after a slice of background work, in its durations."""
+_PAUSE = 4.0
+"""Pause after background work, in its durations: it takes a fifth of a core at most."""
+_RETRY_S = 30.0
 _Result = TypeVar("_Result")
 
 
@@ -73,7 +71,7 @@ class DrainGate:
         """Yield the requests of a stream. Raises UnavailableError when the gate closes, even between two requests."""
         while True:
             self.require_open()
-            reading = asyncio.ensure_future(_next(requests))
+            reading = asyncio.ensure_future(anext(requests, None))
             self._readings.add(reading)
             reading.add_done_callback(self._end)
             try:
@@ -92,8 +90,49 @@ class DrainGate:
             reading.exception()
 
 
-async def _next(requests: AsyncIterator[_Message]) -> _Message | None:
-    return await anext(requests, None)
+class BackgroundWork:
+    """Works in a thread while something is due, with pauses in which others have the disk and the processor."""
+
+    def __init__(self, work: Callable[[], WorkDone], notify: Callable[[], None], failure: str, delay_s: float) -> None:
+        """notify: called after changes. failure: what an error means. delay_s: the shortest pause."""
+        self._work, self._notify, self._failure = work, notify, failure
+        self._delay_s = self._pause_s = delay_s
+        self._executor = ThreadPoolExecutor(1, "background")
+        self._task: asyncio.Task[None] | None = None
+        self._is_due, self._is_open = False, True
+
+    def wake(self) -> None:
+        """Work soon, unless that is pending or running. Use it on the event loop."""
+        self._is_due = True
+        if self._is_open and (self._task is None or self._task.done()):
+            self._task = asyncio.create_task(self._run())
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._is_due:
+            await asyncio.sleep(self._pause_s)
+            # messages that arrive meanwhile set it again
+            self._is_due, start_s = False, loop.time()
+            try:
+                done = await loop.run_in_executor(self._executor, self._work)
+                self._pause_s = max(self._delay_s, _PAUSE * (loop.time() - start_s))
+            except Exception as error:
+                _log.error("%s, again in %.0f s: %s", self._failure, _RETRY_S, error)
+                # a part may have been done before
+                done, self._pause_s = WorkDone(is_changed=True, is_due=True), _RETRY_S
+            self._is_due |= done.is_due
+            if done.is_changed:
+                self._notify()
+
+    def cancel(self) -> None:
+        """End before the next work."""
+        self._is_open = False
+        if self._task is not None:
+            self._task.cancel()
+
+    def close(self) -> None:
+        """Wait until the work in the thread has ended."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
 
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
@@ -113,10 +152,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._commit_is_due = False
         self._encoded_parts = EncodedPartCache()
         # one thread each: a comparison of frames or a rendering must not delay the acknowledgements; encoding included
-        self._aligner = ThreadPoolExecutor(1, "align")
         self._views = WorkerPool("views", waiting=MAX_VIEWS_WAITING)
-        self._aligning: asyncio.Task[None] | None = None
-        self._slices: asyncio.Task[None] | None = None
+        self._map_changes = ChangeNotifier()
+        align, notify = functools.partial(engine.align_due, 1), self._map_changes.notify
+        self._aligning = BackgroundWork(align, notify, "frames are not compared", _ALIGN_DELAY_S)
+        self._slices = BackgroundWork(engine.work_in_background, notify, "maps are not moved or deleted", 0.0)
         self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
@@ -139,9 +179,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def drain(self) -> None:
         """End every open stream and every later call with UNAVAILABLE."""
         self._gate.close()
-        for task in (self._aligning, self._slices):
-            if task is not None:
-                task.cancel()
+        self._aligning.cancel()
+        self._slices.cancel()
         self._map_changes.notify()
 
     async def store_message(self, session: SessionRecord, message: bytes | EncodedSubset) -> StoredCount:
@@ -159,9 +198,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
         if self.engine.frames.are_compared:
-            self._align_in_background()
-        if self.engine.has_background_work and self._gate.is_open and (self._slices is None or self._slices.done()):
-            self._slices = asyncio.create_task(self._work_in_slices())
+            self._aligning.wake()
+        if self.engine.has_background_work:
+            self._slices.wake()
 
     def _commit_soon(self) -> None:
         """Commit what is queued in the commit thread; one call serves all messages queued before it begins."""
@@ -175,9 +214,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def close(self) -> None:
         """Wait until the work in threads has ended."""
-        self._aligner.shutdown(wait=True, cancel_futures=True)
-        for pool in (self._views, self._exports, self._queries, self._joins, self._keyframes, self._workers):
-            pool.close()
+        pools = self._views, self._exports, self._queries, self._joins, self._keyframes, self._workers
+        for part in (self._aligning, self._slices, *pools):
+            part.close()
         self._committer.shutdown(wait=True)
         if self._refiner is not None:
             self._refiner.close()
@@ -253,7 +292,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 if len(response.rejected) >= MAX_REPORTED_REJECTIONS:
                     raise
                 response.rejected.add(index=request.keyframe.index, reason=str(error))
-        self._align_in_background()  # they may show where an unknown frame is
+        self._aligning.wake()  # they may show where an unknown frame is
         return response
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
@@ -388,45 +427,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         await self._work(context, self.engine.unban, request.agent_id)
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
-
-    def _align_in_background(self) -> None:
-        """Compare the frames that are due soon, unless that is pending or running. Use on the event loop."""
-        self._align_again = True
-        if self._gate.is_open and (self._aligning is None or self._aligning.done()):
-            self._aligning = asyncio.create_task(self._align())
-
-    async def _align(self) -> None:
-        """Compare one agent after the other, with pauses, until none is due."""
-        loop, pause_s = asyncio.get_running_loop(), self._align_pause_s
-        while self._align_again and self._gate.is_open:
-            await asyncio.sleep(pause_s)
-            # messages that arrive meanwhile set it again
-            self._align_again, start_s = False, loop.time()
-            try:
-                run = await loop.run_in_executor(self._aligner, self.engine.align_due, 1)
-                pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (loop.time() - start_s))
-            except Exception as error:
-                _log.error("frames are not compared, again in %.0f s: %s", _ALIGN_RETRY_S, error)
-                # an agent may have been compared before
-                run, pause_s = AlignmentRun(is_changed=True, is_due=True), _ALIGN_RETRY_S
-            self._align_pause_s = pause_s
-            self._align_again |= run.is_due
-            if run.is_changed:
-                self._map_changes.notify()
-
-    async def _work_in_slices(self) -> None:
-        """Do the engine's background work, with pauses in which others have the disk and the processor."""
-        loop = asyncio.get_running_loop()
-        while self.engine.has_background_work and self._gate.is_open:
-            start_s = loop.time()
-            try:
-                await loop.run_in_executor(None, self.engine.work_in_background)
-                pause_s = _SLICE_PAUSE * (loop.time() - start_s)
-            except GaussLiteError as error:
-                _log.error("former maps are not deleted, again in %.0f s: %s", _ALIGN_RETRY_S, error)
-                pause_s = _ALIGN_RETRY_S
-            self._map_changes.notify()
-            await asyncio.sleep(pause_s)
 
     async def _session(self, session_id: str, context: Any) -> SessionRecord:
         """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""

@@ -23,7 +23,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.alignment import FrameAligner, FrameDecisions, TeamView
 from gausslite.fusion.epochs import MAX_FORMER_MAPS, agent_of, is_former
 from gausslite.fusion.frames import RECORD as ALIGNMENT
-from gausslite.fusion.frames import FrameAlignments
+from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.fused_map import REFINEMENT, FusedMapLayers, MapLayer, load_refinement, save_refinement
 from gausslite.fusion.keyframe_pool import (
     ORDER_RECORD,
@@ -37,16 +37,16 @@ from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.objects import RECORD as OBJECTS
 from gausslite.fusion.objects import MergedObjects, TeamObjects, open_merged_objects
-from gausslite.fusion.refinement import RefineInput
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.update_log import PutOutcome
 from gausslite.fusion.updates import MissionClock, PendingUpdate, UpdateChecks, UpdateQueue, require_own, store_slices
-from gausslite.fusion.vote_input import VoteInput
+from gausslite.fusion.vote_input import MOVED_BYTES, SLICE_VOXELS, VoteInput
 from gausslite.plugins import Group, load
 
 _log = logging.getLogger(__name__)
 _PUBLISHED_TILES = 8
+_NO_KEYS = np.zeros(0, np.int64)
 
 
 class JoinResult(NamedTuple):
@@ -61,8 +61,8 @@ class JoinResult(NamedTuple):
     keyframes: tuple[int, ...]
 
 
-class AlignmentRun(NamedTuple):
-    """What a look at the agents' frames has done: whether the fused map changed, and whether more agents are due."""
+class WorkDone(NamedTuple):
+    """What work in the background has done: whether the fused map changed, and whether more is due."""
 
     is_changed: bool
     is_due: bool
@@ -108,12 +108,13 @@ class FusionEngine:
         self._checks = UpdateChecks(store, settings.quotas, MissionClock(store))
         self._unrecorded: dict[str, Int64[ndarray, " k"]] = {}
         self._aligner = aligner
-        # maps that the aligner reads as a whole
-        self._unobserved = set(store.agents())
         # former maps whose name the watchers do not have yet, with the tiles to publish
         self._renamed: dict[str, list[int]] = {}
         # former maps that are deleted, slice by slice
         self._leaving: dict[str, None] = {}
+        # maps whose frame has changed, the next one first: number of the move, voxels left, None before the first slice
+        self._moving: dict[str, tuple[int, Int64[ndarray, " k"] | None]] = {}
+        self._last_move = 0
         for agent_id in sorted({agent_of(name) for name in store.agents() if is_former(name)}):
             self._release_former(agent_id)
 
@@ -260,35 +261,33 @@ class FusionEngine:
                 failed[agent_id] = error
         failed |= self.maps.update({name: keys for name, keys in self._unrecorded.items() if name not in failed})
         for agent_id in [name for name in self._unrecorded if name not in failed]:
-            self._observe(agent_id, self._unrecorded.pop(agent_id))
+            keys = self._unrecorded.pop(agent_id)
+            if self._aligner is not None:
+                self._aligner.observe(agent_id, keys)
             self._release_former(agent_id)
         return failed
 
-    def _observe(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
-        if self._aligner is not None:
-            self._aligner.observe(agent_id, keys)
-
-    def align_due(self, at_most: int | None = None) -> AlignmentRun:
+    def align_due(self, at_most: int | None = None) -> WorkDone:
         """Compare the frames of the agents with enough new updates, and move maps whose frame changes.
 
         It takes up to seconds, without the lock but for slices. at_most: number of agents. Call it from one thread at a
         time. Raises StorageError, UnavailableError if an agent could not be compared.
         """
         if self._aligner is None:
-            return AlignmentRun(False, False)
-        while self._unobserved:
-            name = self._unobserved.pop()
-            self._aligner.observe(name, self.store.keys(name))
+            return WorkDone(False, False)
         before = self.maps.revision()
-        self._move_maps()
         team = TeamView(self.frames.by_rank(), self.store, self.keyframes)
         found = self._aligner.poll(team, at_most)
         with self._changing:
             self._apply(found, team)
-        self._move_maps()
+            names = self.frames.unmoved
+            self._begin_moves()
+            last = self._last_move
+        while any(name in names and number <= last for name, (number, _) in list(self._moving.items())):
+            self._move_slice()
         if found.failure:
             raise UnavailableError(found.failure)
-        return AlignmentRun(self.maps.revision() != before, found.is_due)
+        return WorkDone(self.maps.revision() != before, found.is_due)
 
     def _apply(self, found: FrameDecisions, team: TeamView) -> None:
         """Take over what an aligner has decided, but for frames that have changed meanwhile."""
@@ -301,33 +300,64 @@ class FusionEngine:
             # where an agent is in the team's map was found with the team's frames
             is_found = alignment.is_localised and not before.is_localised
             if not is_found or all(self.frames.has_frame(own, id_) for own, (id_, _) in team.frames.items()):
-                self.frames.decide(name, frame_id, alignment)
+                self.frames.decide(name, frame_id, self._within_memory(name, alignment))
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> None:
-        """Set the motion to the fused map's frame that the agent declares, None if unknown. Raises StorageError."""
-        with self._changing:
-            is_new = self.frames.declare(agent_id, T_fused_agent)
-        if is_new:
-            self._move_map(agent_id)
+        """Set the motion to the fused map's frame that the agent declares, None if unknown. Raises StorageError.
 
-    def _move_maps(self) -> None:
-        while unmoved := self.frames.unmoved:
-            self._move_map(min(unmoved))
-
-    def _move_map(self, agent_id: str) -> None:
-        """Move the agent's map to its frame and state as they are now, in slices between which messages are served."""
+        It counts for the agent's messages from now on; what it has sent before is moved in the background. Raises
+        QuotaError if that would take too much memory.
+        """
         with self._changing:
-            # a frame that changes meanwhile is moved to afterwards
-            self.frames.unmoved -= {agent_id}
-            self.maps.set_frame(agent_id, self.frames.get(agent_id))
-        try:
-            if agent_id in self.frames.unused:
-                self._drop_refined(agent_id)
-            self.maps.move(agent_id)
-        except GaussLiteError:
-            with self._changing:
-                self.frames.unmoved |= {agent_id}
-            raise
+            if T_fused_agent is not None and not np.array_equal(T_fused_agent, self.frames.get(agent_id).declared):
+                placed = self._within_memory(agent_id, FrameAlignment(0, declared=T_fused_agent))
+                if not placed.is_used:
+                    raise QuotaError(f"agent {quote_name(agent_id)}: {placed.message}")
+            self.frames.declare(agent_id, T_fused_agent)
+            self._begin_moves()
+
+    def _within_memory(self, name: str, alignment: FrameAlignment) -> FrameAlignment:
+        """Return an alignment; quarantined, if the map would take more than its agent may in that frame."""
+        needed = self.store.memory_bytes(agent_of(name), _NO_KEYS) + MOVED_BYTES * self.store.totals(name).voxels
+        if alignment.is_identity or not alignment.is_used or needed <= self.settings.agent_bytes:
+            return alignment
+        message = (
+            f"frame: expected a map that fits {self.settings.agent_bytes >> 10} KiB when it is moved, got a larger one"
+        )
+        return replace(
+            alignment, state=AlignmentState.QUARANTINED, message=f"{message} (memory-mb divided by quota-agents)"
+        )
+
+    def _begin_moves(self) -> None:
+        for name in sorted(self.frames.unmoved):
+            self.maps.set_frame(name, self.frames.get(name))
+            self._last_move += 1
+            # behind the others, also if its frame changes again
+            self._moving.pop(name, None)
+            self._moving[name] = self._last_move, None
+        self.frames.unmoved = frozenset()
+
+    def _move_slice(self) -> None:
+        """Move a slice of a map to its frame and state as they are now; the next slice is another map's."""
+        with self._changing:
+            self._begin_moves()
+            if not self._moving:
+                return
+            name = next(iter(self._moving))
+            number, left = self._moving[name] = self._moving.pop(name)
+        if name in self.frames.unused:
+            self._drop_refined(name)
+        keys = self.store.keys(name) if left is None else left
+        failed = self.maps.update({name: keys[:SLICE_VOXELS]})
+        with self._changing:
+            if name in self._moving and self._moving[name][0] == number:
+                del self._moving[name]
+                if failed:
+                    self.frames.unmoved |= {name}
+                elif len(keys) > SLICE_VOXELS:
+                    self._moving[name] = number, keys[SLICE_VOXELS:]
+        for error in failed.values():
+            raise error
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first.
@@ -348,19 +378,6 @@ class FusionEngine:
         moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in unused)
         return [keyframe for keyframe in moved if keyframe is not None]
 
-    def refinement_input(self) -> RefineInput:
-        """Return the fused map and all agents' keyframes. Raises MismatchError if one is empty."""
-        # before the map is read: what changes meanwhile counts as changed
-        revision, (voted, regions) = self.maps.revision(), self.maps.voted_regions()
-        encoded = self.keyframes.read(self.keyframes.names())
-        if not encoded or len(voted.gaussians) == 0:
-            raise MismatchError(
-                f"refinement: expected a fused map and keyframes, got {len(voted.gaussians)} Gaussians and "
-                f"{len(encoded)} keyframes; agents send keyframes with handover = true"
-            )
-        keyframes = self.in_fused_frame(self.keyframes.decode(encoded))
-        return RefineInput(voted.gaussians, keyframes, regions, self.grid, revision)
-
     def store_refined(self, gaussians: Gaussians, revision: int, sources: tuple[str, ...]) -> None:
         """Store the result of a refinement of the vote at this revision, shaped by these agents' keyframes.
 
@@ -372,7 +389,7 @@ class FusionEngine:
             changed = self.maps.changed_since(revision)
         save_refinement(self.store, shown.without(changed))
         unused = self.frames.unused
-        if gone := [name for name in sources if name in unused or not self.keyframes.count(name)]:
+        if gone := [name for name in sources if name in unused or not self.keyframes.indices(name)]:
             self._drop_refined(gone[0])
             raise MismatchError(f"refinement: expected the keyframes of {', '.join(gone)} to stay, got them out of use")
 
@@ -425,37 +442,44 @@ class FusionEngine:
     @property
     def has_background_work(self) -> bool:
         """Whether `work_in_background` has something to do."""
-        return bool(self._leaving or self._renamed or self.keyframes.has_former)
+        return bool(self._leaving or self._renamed or self._moving or self.frames.unmoved or self.keyframes.has_former)
 
-    def work_in_background(self) -> None:
-        """Delete a slice of what has been released, or publish names, as long as a message. Raises StorageError."""
+    def work_in_background(self) -> WorkDone:
+        """Do a slice of what waits, as long as a message: move maps, publish names, delete. Raises StorageError."""
+        self._move_slice()
         with self._changing:
-            if self._renamed:
-                name, tiles = next(iter(self._renamed.items()))
-                self.maps.publish_name(name, tiles[-_PUBLISHED_TILES:])
-                del tiles[-_PUBLISHED_TILES:]
-                if not tiles:
-                    del self._renamed[name]
-                return
-            if self.keyframes.remove_next() or not self._leaving:
-                return
-            name = next(iter(self._leaving))
-            keys = self.store.remove_slice(name)
-            if len(keys):
-                self.maps.update({name: keys})
-                return
-            for part in (self.frames, self.store, self.maps):
-                part.remove_agent(name)
-            self._unrecorded.pop(name, None)
-            self._forget(name)
-            del self._leaving[name]
-            if agent_of(name) not in map(agent_of, self.members.sources):
-                self.store.end_epochs(agent_of(name))
+            self._work_on_former()
+        return WorkDone(True, self.has_background_work)
+
+    def _work_on_former(self) -> None:
+        if self._renamed:
+            name, tiles = next(iter(self._renamed.items()))
+            self.maps.publish_name(name, tiles[-_PUBLISHED_TILES:])
+            del tiles[-_PUBLISHED_TILES:]
+            if not tiles:
+                del self._renamed[name]
+            return
+        if self.keyframes.remove_next() or not self._leaving:
+            return
+        name = next(iter(self._leaving))
+        keys = self.store.remove_slice(name)
+        if len(keys):
+            self.maps.update({name: keys})
+            return
+        for part in (self.frames, self.store, self.maps):
+            part.remove_agent(name)
+        self._unrecorded.pop(name, None)
+        self._forget(name)
+        del self._leaving[name]
+        if agent_of(name) not in map(agent_of, self.members.sources):
+            self.store.end_epochs(agent_of(name))
 
     def _begin_map(self, agent_id: str) -> None:
         """Let the agent's present map become a former one, in constant time. Raises StorageError."""
         former = self.maps.begin_map(agent_id, (ALIGNMENT,), (OBJECTS, ORDER_RECORD))
         self.frames.begin_map(agent_id, former)
+        if agent_id in self._moving:
+            self.frames.unmoved |= {former}
         self.keyframes.begin_map(agent_id, former)
         self.objects.remove_agent(agent_id)
         self.traffic.remove_agent(agent_id)
@@ -463,13 +487,12 @@ class FusionEngine:
             self._unrecorded[former] = self._unrecorded.pop(agent_id)
         self._forget(agent_id)
         if former in self.store.agents():
-            self._unobserved.add(former)
             self._renamed[former] = self.maps.tiles(MapLayer.VOTE)[1].tolist()
         else:
             self.frames.remove_agent(former)
 
     def _forget(self, name: str) -> None:
-        self._unobserved.discard(name)
+        self._moving.pop(name, None)
         if self._aligner is not None:
             self._aligner.forget(name)
 
@@ -528,7 +551,7 @@ class FusionEngine:
             kappa_sum=totals.kappa_sum,
             won_voxels=self.maps.won_voxels(agent_id),
             last_update_seq=totals.highest_update_seq,
-            keyframes=self.keyframes.count(agent_id),
+            keyframes=len(self.keyframes.indices(agent_id)),
             targets=() if report is None else report.graph.targets,
             alignment=self.frames.get(agent_id),
             traffic=self.traffic.of(agent_id),

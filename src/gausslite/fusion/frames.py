@@ -29,14 +29,12 @@ RECORD = "alignment"
 class AlignmentState(StrEnum):
     """How an agent's contribution is used."""
 
-    UNKNOWN = "unknown"
-    """Too little overlap with other agents: used as sent, or as declared."""
+    UNKNOWN = "unknown"  # used as sent, or as declared, while no comparison shows whether that is right
     REFERENCE = "reference"
     ALIGNED = "aligned"
     CORRECTED = "corrected"
     QUARANTINED = "quarantined"
-    UNLOCALISED = "unlocalised"
-    """Its frame is unknown to itself and to the server."""
+    UNLOCALISED = "unlocalised"  # its frame is unknown to itself and to the server
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +62,7 @@ class FrameFit:
     is_better: bool  # distance and colour improve by more than four times their uncertainty
     is_apart: bool  # before the motion, the surfaces are farther apart than those of maps in the same frame
     is_sure: bool = False
+    looks_different: bool = False  # textured surfaces do not show the same, so they are of two places
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> FrameFit:
@@ -234,16 +233,16 @@ class FrameAlignments:
             self.add(agent_id, replace(self.get(agent_id), state=state))
         self._contributors.add(agent_id)
 
-    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> bool:
+    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> None:
         """Set the motion that the agent declares, None if it does not know its frame. Raises StorageError.
 
-        Returns whether the motion changed; what was found of an unknown frame stays. The same motion again takes back
-        its corrections. A quarantine stays until the maps agree.
+        What was found of an unknown frame stays. The same motion again takes back its corrections. A quarantine stays
+        until the maps agree.
         """
         current = self.get(agent_id)
         if T_fused_agent is None:
             if current.is_unknown:
-                return False
+                return
             trusts = "this server compares no frames (frame-alignment = trust, or no plug-in)"
             declared = current.unlocalised("" if self.are_compared else trusts)
         elif current.is_unknown or current.segments or not np.array_equal(current.declared, T_fused_agent):
@@ -251,9 +250,9 @@ class FrameAlignments:
             if current.state is AlignmentState.QUARANTINED:
                 declared = replace(current, declared=T_fused_agent, segments=())
         else:
-            return False
+            return
         self.add(agent_id, declared)
-        return True
+        self.unmoved |= {agent_id}
 
     def decide(self, agent_id: str, frame_id: int, alignment: FrameAlignment) -> None:
         """Replace the alignment that was decided for this frame, unless the agent has another one by now.

@@ -219,20 +219,9 @@ class FusedMapLayers:
         return failed
 
     def set_frame(self, agent_id: str, alignment: FrameAlignment) -> None:
-        """Read the agent's updates in this frame from now on; `move` follows."""
+        """Read the agent's updates in this frame from now on; `update` moves what is stored."""
         with self._lock:
             self._votes.set_frame(agent_id, alignment)
-
-    def move(self, agent_id: str) -> None:
-        """Move the agent's map to its frame, in slices between which others have their turn. Raises StorageError."""
-        for keys in self._votes.slices(agent_id):
-            for error in self.update({agent_id: keys}).values():
-                raise error
-
-    def read(self, agent_id: str) -> VoxelBatch:
-        """Return the agent's updates as the vote reads them. Raises StorageError."""
-        with self._lock:
-            return self._votes.batch(agent_id)
 
     def moved_bytes(self, agent_id: str) -> int:
         """Return the memory that an agent's voxels take here as they are in another frame."""

@@ -65,7 +65,11 @@ class KeyframePool:
     def __init__(self, store: FusionStore, quotas: Quotas, decode: FrameDecoder = no_decoder) -> None:
         """Raises CodecError for a damaged record, StorageError."""
         self._store, self._quotas, self._decode = store, quotas, decode
-        # held by changes; they replace an agent's keyframes as a whole
+        # held while a keyframe is written, with pauses for others
+        self._writing = Lock()
+        # of the keyframe that is being written: its map
+        self._owner = ""
+        # held for a moment by changes; they replace an agent's keyframes as a whole
         self._changing = Lock()
         store.remove_unfinished_keyframes()
         self._ids = itertools.count()
@@ -84,25 +88,28 @@ class KeyframePool:
         this keyframe alone exceeds a limit, StorageError.
         """
         self._quotas.require_keyframe(keyframe.index, keyframe.pixels, len(keyframe.data))
-        with self._changing:
-            # from here on, `begin_map` waits
-            stored = dict(self._stored.setdefault(keyframe.agent_id, {}))
+        with self._writing:
+            self._owner = keyframe.agent_id
             self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data, session_id)
-            before = stored.get(keyframe.index)
-            if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
-                del stored[keyframe.index]
-            stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data), next(self._ids))
-            wanted = {*(selected or stored), keyframe.index}
-            kept = self._newest_within_limits({index: own for index, own in stored.items() if index in wanted})
-            if len(kept) < len(stored):
-                self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
-            self._stored[keyframe.agent_id] = kept
-            order = [(index, own.capture_time_ns) for index, own in kept.items()]
-            self._store.save_record(keyframe.agent_id, ORDER_RECORD, json.dumps(order).encode())
+            with self._changing:
+                if self._owner == keyframe.agent_id:
+                    self._keep(keyframe, selected)
+                else:
+                    self._former.setdefault(self._owner, []).append(keyframe.index)
 
-    def count(self, agent_id: str) -> int:
-        """Return the number of keyframes of this agent."""
-        return len(self._stored.get(agent_id, ()))
+    def _keep(self, keyframe: EncodedKeyframe, selected: Collection[int]) -> None:
+        stored = dict(self._stored.get(keyframe.agent_id, {}))
+        before = stored.get(keyframe.index)
+        if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
+            del stored[keyframe.index]
+        stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data), next(self._ids))
+        wanted = {*(selected or stored), keyframe.index}
+        kept = self._newest_within_limits({index: own for index, own in stored.items() if index in wanted})
+        if len(kept) < len(stored):
+            self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
+        self._stored[keyframe.agent_id] = kept
+        order = [(index, own.capture_time_ns) for index, own in kept.items()]
+        self._store.save_record(keyframe.agent_id, ORDER_RECORD, json.dumps(order).encode())
 
     def indices(self, agent_id: str) -> tuple[int, ...]:
         """Return the frame indices of this agent's keyframes, the newest last."""
@@ -127,9 +134,11 @@ class KeyframePool:
 
     def begin_map(self, agent_id: str, former: str) -> None:
         """Drop the agent's keyframes, also the one that is being written; `remove_next` deletes them."""
-        if agent_id in self._stored:
-            with self._changing:
-                self._former[former] = list(self._stored.pop(agent_id, ()))
+        with self._changing:
+            if self._owner == agent_id:
+                self._owner = former
+            if stored := self._stored.pop(agent_id, None):
+                self._former[former] = list(stored)
 
     @property
     def has_former(self) -> bool:

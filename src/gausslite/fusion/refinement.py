@@ -1,37 +1,17 @@
-"""Input, settings and progress of what refines the fused map, a plug-in of `gausslite.refiners`."""
+"""Settings and progress of what refines the fused map, a plug-in of `gausslite.refiners`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-
-from jaxtyping import Int64
-from numpy import ndarray
 
 from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.render.rasterizer import Rasterizer
 
 CreateRasterizer = Callable[[], Rasterizer]
 """Creates the rasterizer when it is needed: most servers need no kernels."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RefineInput:
-    """The vote at a revision, and the team's keyframes in its frame.
-
-    regions: the voxels of its task's region that each agent wins; agents that win others only have an entry without.
-    """
-
-    gaussians: Gaussians
-    keyframes: Sequence[AgentKeyframe]
-    regions: Mapping[str, Int64[ndarray, " k"]]
-    grid: VoxelGrid
-    revision: int
 
 
 @dataclass(frozen=True, slots=True)

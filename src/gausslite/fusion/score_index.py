@@ -29,7 +29,7 @@ Scores = NDArray[Any]
 update_seq and row are -1 where the agent has no update of a voxel.
 """
 NO_SCORES: Scores = np.zeros(0, SCORES)
-VOXEL_BYTES, TILE_BYTES = 65, 60
+VOXEL_BYTES, TILE_BYTES = 65, 400
 """What a voxel, and each map's tile with voxels, take in memory here and in the change log; measured."""
 MORE_ROWS_BYTES, ROW_BYTES = 200, 9
 """What the rows of a tile beside the first take, together and each."""
@@ -121,6 +121,8 @@ class ScoreIndex:
 
     def __init__(self) -> None:
         self._maps: dict[str, _Map] = {}
+        # by the place of a tile: the maps that have voxels there, so that a message asks no others
+        self._at: dict[int, set[_Map]] = {}
         self.agents: tuple[str, ...] = ()
         """The names of the maps with rows, sorted."""
 
@@ -153,23 +155,22 @@ class ScoreIndex:
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return the totals of all maps on these voxels, or on all."""
-        parts = self._sorted_scores(self.agents, None if keys is None else np.unique(keys))
-        agent_index = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
-        return VoxelScoreTable(self.agents, agent_index, join_elements([NO_SCORES, *parts]))
+        keys = None if keys is None else np.unique(keys)
+        found = {name: self.sorted_scores(name, keys) for name in self._near(keys)}
+        counts = [len(found.get(name, ())) for name in self.agents]
+        agent_index = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        return VoxelScoreTable(self.agents, agent_index, join_elements([NO_SCORES, *found.values()]))
 
     def sorted_scores(self, name: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
         """Return the map's totals on those of these voxels (ascending keys) that it has, or on all."""
-        return self._sorted_scores([name], keys)[0]
-
-    def _sorted_scores(self, names: Sequence[str], keys: Int64[ndarray, " k"] | None) -> list[Scores]:
-        tables = [self._map(name).voxels for name in names]
+        voxels = self._map(name).voxels
         if keys is None:
-            scores = [_scores(keys_of(places), found) for places, found in (own.select() for own in tables)]
-            return [own.take(np.argsort(own["keys"])) for own in scores]
-        places = places_of(keys)
-        found = [own.get(places) for own in tables]
-        present = [np.flatnonzero(own["rows"] >= 0) for own in found]
-        return [_scores(keys[at], own.take(at)) for own, at in zip(found, present, strict=True)]
+            places, found = voxels.select()
+            scores = _scores(keys_of(places), found)
+            return scores.take(np.argsort(scores["keys"]))
+        found = voxels.get(places_of(keys))
+        present = np.flatnonzero(found["rows"] >= 0)
+        return _scores(keys[present], found.take(present))
 
     def put(self, name: str, scores: Scores) -> None:
         """Replace the map's totals on the voxels of the scores; `add_rows` came before."""
@@ -223,6 +224,8 @@ class ScoreIndex:
         is_first = found["rows"] < 0
         found["rows"][is_first] = rows["numbers"][first[is_first]]
         own.tiles.put(places, found)
+        for place in places.tolist():
+            self._at.setdefault(place, set()).add(own)
         more = np.delete(rows, first[is_first])
         own.added_rows += len(more)
         for tile, number, _ in more.tolist():
@@ -251,14 +254,26 @@ class ScoreIndex:
         if name not in self._maps:
             return np.zeros(0, np.int64)
         own = self._maps[name]
-        for tile in keys_of(own.tiles.remove_from(place)[0]).tolist():
+        tiles = own.tiles.remove_from(place)[0]
+        for tile, at in zip(keys_of(tiles).tolist(), tiles.tolist(), strict=True):
             own.added_rows -= len(own.more_rows.pop(tile, ()))
+            self._at[at].discard(own)
+            if not self._at[at]:
+                del self._at[at]
         places, removed = own.voxels.remove_from(place)
         own.totals = own.totals.replace_part(removed, removed[:0])
         if len(own.tiles) == 0:
             del self._maps[name]
             self.agents = tuple(sorted(self._maps))
         return np.sort(keys_of(places))
+
+    def _near(self, keys: Int64[ndarray, " k"] | None) -> Sequence[str]:
+        """Return the names of the maps with voxels in the tiles of these ones, sorted; of all for None."""
+        if keys is None:
+            return self.agents
+        tiles = np.unique(tiles_at(places_of(keys))).tolist()
+        near = set[_Map]().union(*(self._at.get(tile, ()) for tile in tiles))
+        return [name for name in self.agents if self._maps[name] in near]
 
     def rename(self, name: str, other: str) -> None:
         """Give a map another name, if it exists."""

@@ -14,6 +14,7 @@ from typing import Any
 from gausslite.config.option import check_options, option
 from gausslite.domain.errors import RateLimitError
 from gausslite.wire.security import Caller, Role, caller_or_connection
+from gausslite.wire.status import MAX_ERROR_CHARACTERS
 
 _PERIOD_S = 60.0
 _MAX_ENTRIES = 1000
@@ -36,7 +37,7 @@ class RejectionLog:
 
     def record(self, caller: str, reason: str, message: str) -> None:
         """Log a refusal, or count it for the next line about this caller and reason."""
-        now_s, key = self._clock_s(), (caller, reason)
+        now_s, key, message = self._clock_s(), (caller, reason), message[:MAX_ERROR_CHARACTERS]
         if key not in self._entries:
             if len(self._entries) >= _MAX_ENTRIES:
                 # a hostile network can have any number of addresses

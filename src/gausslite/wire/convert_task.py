@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
@@ -39,6 +39,7 @@ from gausslite.wire.convert import (
     values_of,
 )
 
+_MAX_LISTED: Final = 256
 _MAX_POINTED: Final = 64
 """Points and boxes of a task in all; a region grows around each of them, on the thread that maps frames."""
 
@@ -79,8 +80,9 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
-    _require_known_numbers(message)
     names = {name: tuple(values) for name, values in values_of(message, _NAMES).items()}
+    _require_few(message.relations, message.roles, message.attributes, *names.values())
+    _require_known_numbers(message)
     graph = TaskGraph(
         task_id=message.task_id,
         text=message.text,
@@ -132,6 +134,7 @@ def assigned_from_message(
     message: agent_service_pb2.AssignTaskRequest, parse: Callable[[str], TaskGraph]
 ) -> AssignedTask:
     """Decode the request of an AssignTask call; a text is parsed. Raises TaskError, InvalidInputError."""
+    _require_few(message.pointed, message.excluded)
     pointed = tuple(map(_pointed_from_message, message.pointed))
     excluded_m = tuple(_surface_point_from_message("excluded", point) for point in message.excluded)
     kind = message.WhichOneof("task")
@@ -169,6 +172,12 @@ def _surface_point_from_message(name: str, message: geometry_pb2.Point) -> Point
     if not all(abs(value) <= MAX_OBJECT_COORDINATE_M for value in point_m):
         raise InvalidInputError(f"{name}: expected coordinates within ±{MAX_OBJECT_COORDINATE_M:g} m, got {point_m}")
     return point_m
+
+
+def _require_few(*lists: Sized) -> None:
+    """Raise TaskError for more than any task has, before anything is made of it."""
+    if (longest := max(map(len, lists))) > _MAX_LISTED:
+        raise TaskError(f"task: expected at most {_MAX_LISTED} objects, relations or points, got {longest}")
 
 
 def _require_known_numbers(message: task_pb2.TaskGraph) -> None:

@@ -22,7 +22,7 @@ from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, StorageError, UnavailableError
 from gausslite.process import handled_signals
 from gausslite.wire import call_limits, security
 from gausslite.wire.channel import KEEPALIVE_S, UNIX, connection_options, host_and_port
@@ -39,6 +39,8 @@ Check = Callable[[], None]
 """Raises GaussLiteError while the service cannot work."""
 _LAST_CALLS_S = 1.0
 """For cancelled calls to end."""
+_MAX_UNARY_BYTES = 1 << 20
+"""Decoded, empty parts of a message take forty times their bytes; images and voxels come in streams."""
 _HEALTH_LIMITS = call_limits.CallLimits(connections=64, idle_s=10)
 # the longest path of a unix socket that Linux accepts
 _MAX_SOCKET_PATH_BYTES = 107
@@ -48,6 +50,8 @@ _OPTIONS = (
     ("grpc.http2.min_ping_interval_without_data_ms", round(500 * KEEPALIVE_S)),
     # else gRPC receives megabytes ahead on each stream, as fast as a client sends; a message that is read is exempt
     ("grpc.http2.bdp_probe", 0),
+    # of one connection: a health watch or a reflection, which no limit of calls counts, takes 18 kB
+    ("grpc.max_concurrent_streams", 512),
     # a second server must fail to bind the port instead of sharing it
     ("grpc.so_reuseport", 0),
 )
@@ -238,7 +242,12 @@ class _Method:
             yield request
 
     def decode(self, data: bytes) -> Any:
-        """Return the request. Raises InvalidInputError."""
+        """Return the request. Raises InvalidInputError, QuotaError."""
+        is_large = self.handler.request_streaming or security.ROLES_OF_METHOD.get(self.name) == frozenset(
+            {security.Role.SERVER}
+        )
+        if len(data) > _MAX_UNARY_BYTES and not is_large:
+            raise QuotaError(f"{self.name}: expected a request of at most {_MAX_UNARY_BYTES} bytes, got {len(data)}")
         try:
             return self.handler.request_deserializer(data)
         except DecodeError as error:

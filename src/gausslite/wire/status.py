@@ -18,6 +18,8 @@ from gausslite.domain import errors
 from gausslite.domain.errors import GaussLiteError
 
 DOMAIN = "gausslite"
+MAX_ERROR_CHARACTERS = 1000
+"""An error quotes what a caller sent; gRPC drops longer ones, and a log would keep them."""
 
 _TABLE: tuple[tuple[type[GaussLiteError], grpc.StatusCode, str], ...] = (
     (errors.ShapeError, grpc.StatusCode.INVALID_ARGUMENT, "SHAPE"),
@@ -90,7 +92,9 @@ def to_status(error: GaussLiteError) -> grpc.Status:
     for target, detail in zip(packed, details, strict=True):
         target.Pack(detail)
     number = code_pb2.Code.Value(code.name)
-    status: grpc.Status = rpc_status.to_status(status_pb2.Status(code=number, message=str(error), details=packed))
+    status: grpc.Status = rpc_status.to_status(
+        status_pb2.Status(code=number, message=str(error)[:MAX_ERROR_CHARACTERS], details=packed)
+    )
     return status
 
 

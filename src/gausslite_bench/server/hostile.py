@@ -20,9 +20,12 @@ from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.domain.pose import transform_of
 from gausslite.domain.voxels import RoiSubset
 from gausslite.wire.channel import ServiceChannel, require_serving
 from gausslite.wire.clients import AgentClient, FusionClient, ParserClient
@@ -39,6 +42,7 @@ from gausslite_bench.server.synthetic_updates import (
 )
 from gausslite_bench.service_process import ServiceProcess
 from gausslite_language.rules import RuleParser
+from gausslite_objects.memory_client import MemoryClient
 
 GOOD_AGENTS = 4
 _SEQ = 1 << 20
@@ -116,12 +120,21 @@ def _voxels(name: str, voxels: int) -> bytes:
     return encode_subset(RoiSubset(name, "", _SEQ, _SEQ, voxels_batch(range(voxels), 7)), GRID)
 
 
-def _flood_of_queries(address: str) -> None:
+def _report_objects(address: str) -> None:
     report = object_report(RuleParser().parse(f"Pick up the {_NOUN}"), _NOUN, 200, 1)
     with FusionClient(address, deadline_s=60.0) as client:
         for _, session_id in _join(address, 48):
             client.report_objects(session_id, report)
+
+
+def _flood_of_queries(address: str) -> None:
+    _report_objects(address)
     _flood(address, lambda client, _: client.query_objects(_NOUN))
+
+
+def _flood_of_memory(address: str) -> None:
+    _report_objects(address)
+    _flood(address, lambda client, _: client.read(), lambda to, _: MemoryClient(to))
 
 
 def _flood_of_views(address: str, callers: int, connect: Callable[[str, float], ServiceChannel] = FusionClient) -> None:
@@ -146,6 +159,15 @@ def _new_maps(address: str) -> None:
         send_all(address, session_id, [_voxels("bad-0", 50)])
 
     _flood(address, begin, _client, callers=1)
+
+
+def _new_frames(address: str) -> None:
+    _hold_map(address)
+    _flood(address, lambda client, n: client.join("bad-0", GRID, T_fused_agent=_moved(n)), _client, callers=1)
+
+
+def _moved(number: int) -> Float64[ndarray, "4 4"]:
+    return transform_of(np.array([0.1 * (number % 10), 0.0, 0.0, 0.0, 0.0, 0.1 * (number % 7)]))
 
 
 def _flood_of_digests(address: str) -> None:
@@ -232,6 +254,8 @@ ATTACKS: Mapping[str, Attack] = {
         "50 that watch the map anew, each without another name", lambda to: _flood(to, _new_snapshot, callers=50)
     ),
     "fresh-map": Attack("one that holds 400 000 voxels and begins new maps of 50", _new_maps),
+    "frames": Attack("one that holds 400 000 voxels and declares ever new frames", _new_frames),
+    "memory": Attack("8 that read what people said of 48 x 200 objects", _flood_of_memory),
     "digests": Attack("16 that ask for the digests of 400 000 voxels", _flood_of_digests),
     "keyframes": Attack("8 that send keyframes of 1920 x 1080, noise as PNG", _large_keyframes),
     "slow-readers": Attack("64 watchers that read one block", _slow_readers),

@@ -11,7 +11,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_voxels
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
-from gausslite.fusion.refinement import RefineInput, RefineSettings
+from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.choose import choose_rasterizer
@@ -20,6 +20,7 @@ from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
 from gausslite_evaluation.compare import MapScores, score_team
 from gausslite_places.frame_aligner import MapAligner
+from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.refinement import Refinement
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"

@@ -1,6 +1,8 @@
 """A robot that begins a new map: its former ones stay in the fused map until the new one has outgrown them."""
 
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from opened_stores import OpenStore, opener
 
 from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.pose import transform_of
+from gausslite.fusion.alignment import FrameDecisions
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.epochs import MAX_FORMER_MAPS, is_former
+from gausslite.fusion.frames import AlignmentState, Segment
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
 from gausslite.fusion.sqlite_store import IN_MEMORY, SqliteStore
 from gausslite.fusion.store import FusionStore
@@ -158,9 +162,23 @@ def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPat
     send(engine, session, 1, {cell: [1] for cell in range(50, 100)})
     assert fused_kappas(engine) == dict.fromkeys(range(50, 100), 1)
     # voxels in another frame take more, where they lie and where they came from
-    engine.declare_frame("ant", transform_of(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])))
-    work(engine)
+    away = transform_of(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(QuotaError, match="a map that fits 4 KiB when it is moved"):
+        engine.declare_frame("ant", away)
+    assert fused_kappas(engine) == dict.fromkeys(range(50, 100), 1)
+    engine._aligner = Mock()
+    segments = (Segment(0, away, ("bee",)),)
+    corrected = replace(engine.frames.get("ant"), state=AlignmentState.CORRECTED, segments=segments)
+    engine._aligner.poll.return_value = FrameDecisions({"ant": corrected})
+    for _ in range(2):
+        assert engine.align_due()
+        assert engine.frames.get("ant").state is AlignmentState.QUARANTINED
+    assert fused_kappas(engine) == {}
+    small = engine_on(memory_bytes=64 * 5_000)
+    session = reboot(small, "cat")
+    small.declare_frame("cat", away)
+    send(small, session, 1, {key: [2] for key in range(30)}, "cat")
     with pytest.raises(QuotaError, match="at most 5000 bytes"):
-        send(engine, session, 2, {cell: [2] for cell in range(50, 60)})
+        send(small, session, 2, {key: [2] for key in range(50, 60)}, "cat")
     monkeypatch.setattr("gausslite.fusion.limits._CONTAINER_LIMITS", ())
     assert FusionSettings(grid=GRID).agent_bytes > 1 << 20

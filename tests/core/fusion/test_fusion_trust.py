@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_running import GRID, make_subset
+from fusion_running import GRID, keys, make_subset
 
 from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import encode_subset
@@ -23,6 +23,7 @@ from gausslite.domain.errors import (
     SessionUnknownError,
 )
 from gausslite.domain.objects import ObjectReport
+from gausslite.domain.pose import transform_of
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
@@ -313,3 +314,36 @@ def test_a_joiner_that_is_gone_and_never_contributed_fixes_nothing() -> None:
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
     with pytest.raises(MismatchError, match="expected 'map' as agreed here, got 'odom'"):
         engine.join("bee", MissionConfig("", "odom", GRID.size_m))
+
+
+def test_ever_new_frames_cost_a_slice_at_a_time_and_the_last_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gausslite.fusion.engine.SLICE_VOXELS", 10)
+    store = SqliteStore()
+    engine, up = new_engine(store), np.array([0.0, 0.0, GRID.size_m, 0.0, 0.0, 0.0])
+    for name, start in (("bad", 0), ("good", 1000)):
+        engine.contribute(join(engine, name), make_subset(name, 1, {start + i: [3] for i in range(50)}), GRID)
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "batch", lambda *_: pytest.fail("a call that reads a map"))
+        for turns in (1, 2, 3):
+            engine.declare_frame("bad", transform_of(turns * up))
+        engine.declare_frame("good", transform_of(up))
+    # a message counts in the new frame at once
+    engine.contribute(join(engine, "good"), make_subset("good", 2, {2000: [3]}), GRID)
+    assert engine.maps.voted_map("good").keys.max() == keys(2000).max() + heights(1)
+    # the turns are fair, also for one that begins again and again
+    for _ in range(12):
+        engine.declare_frame("bad", transform_of(up))
+        engine.declare_frame("bad", transform_of(2 * up))
+        engine.work_in_background()
+    assert sorted(engine.maps.voted_map("good").keys) == sorted(keys(*range(1000, 1050), 2000) + heights(1))
+    # the move goes on under the name of a former map
+    engine.join("bad", ANYTHING, fresh_map=True, token="own")
+    while engine.has_background_work:
+        engine.work_in_background()
+    assert sorted(engine.maps.voted_map("bad:0").keys) == sorted(keys(*range(50)) + heights(2))
+
+
+def heights(voxels: int) -> int:
+    """Return what so many voxels of height add to a key."""
+    above, below = (GRID.keys(np.array([[0.0, 0.0, z * GRID.size_m + 1e-3]], np.float32))[0] for z in (voxels, 0))
+    return int(above - below)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from gausslite.domain.voxels import tile_of, tiles_of
+from gausslite.domain.voxels import VoxelGrid, tile_of, tiles_of
 from gausslite.fusion import packed_table
 from gausslite.fusion.packed_table import PackedTable, keys_of, places_of, tiles_at
+from gausslite.fusion.score_index import ROWS, SCORES, ScoreIndex
 
 ABSENT = np.array((-1, 0), np.dtype([("seqs", "i8"), ("counts", "u2")]))
 
@@ -61,3 +62,29 @@ def test_a_table_has_what_a_dict_has(seed: int, monkeypatch: pytest.MonkeyPatch)
             assert gone == {key: model.pop(key) for key in ordered[-5:]}
             assert len(content(other.select())) == len(model) + len(gone)
         assert content(table.select()) == model
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_message_asks_the_maps_that_have_its_voxels(seed: int) -> None:
+    rng, index, grid = np.random.default_rng(seed), ScoreIndex(), VoxelGrid(0.1)
+    for number in range(1, 200):
+        name = f"map-{rng.integers(20)}"
+        if name in index.agents and rng.random() < 0.3:
+            index.remove_from(name, index.last_tiles(name, int(rng.integers(1, 200)))[0])
+            continue
+        corner_m = 1.6 * rng.integers(-3, 3, 3)
+        keys = np.unique(grid.keys((corner_m + rng.uniform(0, 2, (20, 3))).astype(np.float32)))
+        index.add_rows(name, np.array([(tile, number, 60) for tile in np.unique(tiles_of(keys)).tolist()], ROWS))
+        scores = np.zeros(len(keys), SCORES)
+        scores["keys"], scores["update_seqs"], scores["counts"], scores["rows"] = keys, number, 1, number
+        index.put(name, scores)
+        asked, every = index.scores(keys), index.scores()
+        expected = every.take(np.flatnonzero(np.isin(every.scores["keys"], keys)))
+        assert np.array_equal(asked.agent_index, expected.agent_index)
+        assert np.array_equal(asked.scores, expected.scores)
+    far = grid.keys(np.full((1, 3), 50.0, np.float32))
+    assert index._near(far) == []
+    for name in index.agents:
+        index.remove_from(name, index.last_tiles(name, 1 << 20)[0])
+    # nothing is kept of maps that are gone
+    assert (index.agents, len(index._at)) == ((), 0)

@@ -163,6 +163,7 @@ def test_an_agent_that_is_used_no_more_takes_the_refinement_along_that_its_keyfr
     refined, since = shown(engine), engine.maps.revision(MapLayer.REFINED)
     if gone == "frame of cat":
         engine.declare_frame("cat", None)
+        engine.work_in_background()
     else:
         engine.evict(gone, ban=True)
     expected = voted if gone != "bee" else refined

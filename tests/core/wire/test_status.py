@@ -15,7 +15,7 @@ from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.channel import MAX_MESSAGE_BYTES
 from gausslite.wire.clients import ParserClient
 from gausslite.wire.server import Service
-from gausslite.wire.status import code_and_reason, error_from_reason
+from gausslite.wire.status import MAX_ERROR_CHARACTERS, code_and_reason, error_from_reason
 
 ERRORS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, GaussLiteError)]
 CODES = {
@@ -110,3 +110,21 @@ def test_a_missed_deadline_is_unavailable() -> None:
     )
     with serving([slow]) as server, ParserClient(server.address, deadline_s=0.2) as client:
         pytest.raises(UnavailableError, client.parse, "anything").match(rf"^parser {server.address}: no answer in time")
+
+
+def test_a_request_is_small_and_so_is_the_error_that_quotes_it(caplog: pytest.LogCaptureFixture) -> None:
+    class Quoting(parser_service_pb2_grpc.ParserServiceServicer):
+        async def ParseTask(self, request: Any, context: Any) -> TaskGraph:
+            raise errors.TaskError(f"task: expected less, got {request.text}")
+
+    quoting = Service(
+        "gausslite.v1.ParserService",
+        lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(Quoting(), server),
+    )
+    with serving([quoting]) as server, ParserClient(server.address) as client:
+        with pytest.raises(errors.TaskError, match="task: expected less, got xxx") as quoted:
+            client.parse("x" * 900_000)
+        with pytest.raises(QuotaError, match="a request of at most 1048576 bytes, got 11"):
+            client.parse("x" * 1_100_000)
+    assert len(str(quoted.value)) <= MAX_ERROR_CHARACTERS
+    assert all(len(record.getMessage()) < 2 * MAX_ERROR_CHARACTERS for record in caplog.records)

@@ -11,6 +11,7 @@ from gausslite.domain.errors import InvalidInputError, MissingPluginError, Sessi
 from gausslite.domain.objects import ObjectReport, ObjectRole
 from gausslite.domain.task import TaskGraph
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import task_pb2
 from gausslite.wire.convert_task import object_from_message, object_to_message, report_to_message
 
 
@@ -48,7 +49,10 @@ def test_hostile_reports_and_queries_are_refused_and_change_nothing(fusion: Runn
     nan.objects[0].confidence = float("nan")
     no_task = report_to_message(session, ObjectReport(GRAPH))
     no_task.ClearField("task")
-    for request in (many, no_role, no_box, nan, no_task):
+    # refused before they are made: they would hold the event loop
+    relations = report_to_message(session, ObjectReport(GRAPH))
+    relations.task.relations.extend([task_pb2.Relation(predicate=task_pb2.PREDICATE_ON)] * 100_000)
+    for request in (many, no_role, no_box, nan, no_task, relations):
         with pytest.raises(grpc.RpcError) as refused:
             fusion.stub.ReportObjects(request)
         assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT

@@ -186,7 +186,7 @@ def test_frames_that_could_not_be_compared_are_compared_later_without_another_me
             raise failures.pop()
         return fit_frame(source, target)
 
-    monkeypatch.setattr(servicer, "_ALIGN_RETRY_S", 0.0)
+    monkeypatch.setattr(servicer, "_RETRY_S", 0.0)
     with fusion_server(aligner=MapAligner(GRID, fail_once)) as server:
         for seed, name in enumerate(("ant", "bee")):
             session = server.client.join(name, GRID).session_id
