@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import require_whole
+from gausslite.domain.checks import require_types, require_whole
 from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
 
@@ -156,6 +156,7 @@ class Frame:
     def __post_init__(self) -> None:
         require_whole("frame index", self.index)
         require_whole("frame capture_time_ns", self.capture_time_ns)
+        require_types(camera=(self.camera, Camera))
         size = (self.camera.height_px, self.camera.width_px)
         require_array("frame rgb", self.rgb, (*size, 3), np.uint8)
         require_array("frame depth_m", self.depth_m, size, np.float32)

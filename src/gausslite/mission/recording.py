@@ -29,7 +29,7 @@ from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
-from gausslite.mission.runner import region_file_note
+from gausslite.mission.runner import ground_truth_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP, PoseMode, SourceSettings
 from gausslite.process import print_message
 
@@ -163,7 +163,7 @@ def selected_regions(
     if roi is not None:
         regions += choose_regions(balls_for_small_objects(load_voxel_regions(roi)), objects)
     elif objects:
-        report_region_file(spec, source)
+        report_ground_truth(spec, source)
         regions += choose_regions(source.regions(), objects)
     return [*regions, *(_target_region(point, source) for point in target_at)]
 
@@ -180,8 +180,8 @@ def _target_region(point: TargetPoint, source: Source) -> Region:
     )
 
 
-def report_region_file(spec: str, source: Source) -> None:
-    """Report that ground-truth regions come from a file of the sequence's folder, if there is one."""
-    note = region_file_note(spec, source)
+def report_ground_truth(spec: str, source: Source) -> None:
+    """Report that ground-truth regions are used, if the sequence has some."""
+    note = ground_truth_note(spec, source)
     if note is not None:
         print_message(note)
