@@ -33,7 +33,7 @@ from gausslite.domain.relevance import BallRegion, PointedObject, Region
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import empty_batch
 from gausslite.mission.plan import RunPlan
-from gausslite.mission.runner import ground_truth_note
+from gausslite.mission.runner import ground_truth_notes
 from gausslite.mission.schedule import TaskSchedule
 from gausslite.mission.settings import (
     MissionSettings,
@@ -240,8 +240,8 @@ def map_sequence(
     mapped.result.raise_if_stopped()
     if mapped.result.totals.frames == 0:
         raise mapped.corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
-    truth = ground_truth_note(source.name, source) if task is not None and plan.perception.model is None else None
-    notes = (*filter(None, (truth,)), *as_recorded_notes(source), *skipped, *mapped.mapper.notes)
+    truth = ground_truth_notes(source.name, source) if task is not None and plan.perception.model is None else ()
+    notes = (*truth, *as_recorded_notes(source), *skipped, *mapped.mapper.notes)
     return MapResult(mapped.gaussians, mapped.result.summary(), notes)
 
 

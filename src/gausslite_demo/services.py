@@ -28,10 +28,11 @@ from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region
-from gausslite.mission.recording import calibrate_with_messages, open_recorded, report_ground_truth, stated_values
+from gausslite.mission.recording import calibrate_with_messages, open_recorded, stated_values
 from gausslite.mission.results import MAP, REPORT_PAGE, require_absent
-from gausslite.mission.runner import FrameStream
+from gausslite.mission.runner import FrameStream, ground_truth_notes
 from gausslite.nouns import meant_by
+from gausslite.process import print_message
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
 STORE = "fusion.sqlite"
@@ -135,7 +136,8 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     middle = recorded.indices()[len(recorded) // 2]
     first, second = options.frames or f":{middle}", options.frames or f"{middle}:"
     size, regions = frame_size(options.size, recorded), _scored_regions(options, recorded.regions())
-    report_ground_truth(options.source, recorded)
+    for note in ground_truth_notes(options.source, recorded):
+        print_message(note)
     agents, held_out_positions = [], []
     for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
         training, held_out = HeldOutSplit(_TEST_EVERY).split(select_frames(recorded, frames))

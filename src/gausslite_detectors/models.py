@@ -224,13 +224,13 @@ class ModelSheet:
 def inspect(path: Path) -> ModelSheet:
     """Return the description of a model. Raises ModelFileError if it is damaged or of no known family."""
     model = open_model(path, threads=1)
-    inputs, outputs = (
+    described = [
         tuple(f"{port.name} {port.shape} {port.type.removeprefix('tensor').strip('()')}" for port in side)
         for side in (model.session.get_inputs(), model.session.get_outputs())
-    )
+    ]
     family, classes = _family_of_text(model), tuple[str, ...]()
     if family is None:
         layout = DetectionNetwork(model).layout
         family, classes = layout.family, layout.names
     provider = str(model.session.get_providers()[0]).removesuffix("ExecutionProvider")
-    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, inputs, outputs, classes)
+    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *described, classes=classes)

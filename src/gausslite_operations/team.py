@@ -8,8 +8,6 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict
-
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.command_parser import CommandParser, bounded
@@ -22,6 +20,7 @@ from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, size_text
 from gausslite.wire.channel import is_agent, require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient
+from gausslite.wire.convert import message_to_values
 from gausslite.wire.security import TlsFiles
 
 
@@ -204,10 +203,7 @@ def run_status(options: argparse.Namespace) -> int:
     tls = build(TlsFiles, options).read()
     of_agent = is_agent(options.address, tls)
     with (AgentClient if of_agent else FusionClient)(options.address, tls=tls) as client:
-        # as in protobuf's JSON: 64-bit integers are texts, messages without content are absent
-        values: dict[str, Any] = MessageToDict(
-            client.status(), preserving_proto_field_name=True, always_print_fields_with_no_presence=True
-        )
+        values = message_to_values(client.status())
     if options.json:
         print(json.dumps(values))
     else:

@@ -139,11 +139,7 @@ class CameraPeriods:
 
 def same_camera(a: FolderCamera, b: FolderCamera) -> bool:
     """Return True for cameras of one size and lens with nearly equal intrinsics."""
-    first, other = (
-        np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]) for camera in (a.camera, b.camera)
-    )
-    same_size = (a.camera.width_px, a.camera.height_px) == (b.camera.width_px, b.camera.height_px)
-    return a.lens == b.lens and same_size and bool((np.abs(first - other) <= _SAME_CAMERA * first[0]).all())
+    return a.lens == b.lens and a.camera.is_close_to(b.camera, _SAME_CAMERA)
 
 
 def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
@@ -243,7 +242,7 @@ class SceneMarkers:
     ) -> Any:
         return self._server.scene.add_camera_frustum(
             name,
-            2 * math.atan(camera.height_px / (2 * camera.fy_px)),
+            camera.vertical_fov_rad,
             camera.width_px / camera.height_px,
             scale=scale,
             thickness=0.004,

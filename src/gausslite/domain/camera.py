@@ -77,6 +77,13 @@ class Camera:
         fx_px, fy_px, cx_px, cy_px = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return replace(self, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
 
+    def is_close_to(self, other: Camera, tolerance: float) -> bool:
+        """True for a camera of the same size whose intrinsics differ by at most this share of the focal length."""
+        if (self.width_px, self.height_px) != (other.width_px, other.height_px):
+            return False
+        names = ("fx_px", "fy_px", "cx_px", "cy_px")
+        return all(abs(getattr(self, name) - getattr(other, name)) <= tolerance * self.fx_px for name in names)
+
     def resized(self, width_px: int, height_px: int) -> Camera:
         """Return the camera for an image scaled to this size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
@@ -134,6 +141,11 @@ class Camera:
     def unit_depth_size(self, width_px: float, height_px: float) -> tuple[float, float]:
         """Return the size of a part of the image, divided by the depth of what it shows."""
         return width_px / self.fx_px, height_px / self.fy_px
+
+    @property
+    def vertical_fov_rad(self) -> float:
+        """The vertical field of view."""
+        return float(2 * np.arctan(self.height_px / (2 * self.fy_px)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ def require_types(**arguments: tuple[object, type | tuple[type, ...]]) -> None:
     """Raise InvalidInputError unless each argument, given by its name as value and type or types, has its type."""
     for name, (value, kind) in arguments.items():
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        require_instance(name, value, kind, " or ".join(each.__name__ for each in kinds))
+        require_instance(name, value, kind, " or ".join(option.__name__ for option in kinds))
 
 
 def require_whole(name: str, value: object) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
@@ -229,8 +229,3 @@ def has_whole_chunks(data: bytes) -> bool:
         if kind == b"IEND":
             break
     return offset <= len(data)
-
-
-def linear_light(encoded: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-    """Return sRGB colours in [0, 1] as linear light in [0, 1], in the same precision (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -50,8 +50,7 @@ class BallRegion:
             require_number("ball", value)
         # farther out, float32 does not resolve 0.1 m
         limit_m = _MAX_COORDINATE_M
-        is_point = len(self.centre_m) == 3 and max(map(abs, self.centre_m)) <= limit_m
-        if not (is_point and 0 < self.radius_m <= limit_m):
+        if not (len(self.centre_m) == 3 and max(map(abs, self.centre_m)) <= limit_m and 0 < self.radius_m <= limit_m):
             raise InvalidInputError(
                 f"ball: expected a centre within ±{limit_m:g} m and a radius of 0 to {limit_m:g} m, "
                 f"got {self.centre_m} and {self.radius_m}"

@@ -29,7 +29,7 @@ from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
-from gausslite.mission.runner import ground_truth_note
+from gausslite.mission.runner import ground_truth_notes
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP, PoseMode, SourceSettings
 from gausslite.process import print_message
 
@@ -163,7 +163,8 @@ def selected_regions(
     if roi is not None:
         regions += choose_regions(balls_for_small_objects(load_voxel_regions(roi)), objects)
     elif objects:
-        report_ground_truth(spec, source)
+        for note in ground_truth_notes(spec, source):
+            print_message(note)
         regions += choose_regions(source.regions(), objects)
     return [*regions, *(_target_region(point, source) for point in target_at)]
 
@@ -178,10 +179,3 @@ def _target_region(point: TargetPoint, source: Source) -> Region:
     return pointing().region_at(
         point.point_m, (frame for _, frame in usable_frames(source, range(0, len(source), step)))
     )
-
-
-def report_ground_truth(spec: str, source: Source) -> None:
-    """Report that ground-truth regions are used, if the sequence has some."""
-    note = ground_truth_note(spec, source)
-    if note is not None:
-        print_message(note)

@@ -23,11 +23,11 @@ OnCorrupt = Callable[[int, DatasetError | PoseError], None]
 _NO_FRAME_INDEX = -1
 
 
-def ground_truth_note(spec: str, source: Source) -> str | None:
-    """Return a message if the sequence has ground-truth regions, which find objects without a detector; else None."""
+def ground_truth_notes(spec: str, source: Source) -> tuple[str, ...]:
+    """Return a message if the sequence has ground-truth regions, which find objects without a detector."""
     file = source.regions_file
     origin = f"{file.name} in the sequence's folder" if file else "the sequence" if source.regions() else ""
-    return f"{spec}: no detector: the ground-truth regions of {origin} are used" if origin else None
+    return (f"{spec}: no detector: the ground-truth regions of {origin} are used",) if origin else ()
 
 
 @dataclass(frozen=True, slots=True)

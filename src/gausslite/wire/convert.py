@@ -8,7 +8,8 @@ from enum import Enum
 from typing import Any, TypeVar
 
 import numpy as np
-from google.protobuf.message import DecodeError
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import DecodeError, Message
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
@@ -341,3 +342,11 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     winners = tuple(names[i] for i in winner)
     of_block = values_of(message, ("revision", "snapshot", "last"))
     return MapUpdate(**of_block, first=first, batch=batch, grid=grid, winners=winners)
+
+
+def message_to_values(message: Message) -> dict[str, Any]:
+    """Return the fields by name, as in protobuf's JSON: 64-bit integers are texts, messages without content absent."""
+    values: dict[str, Any] = MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
+    return values
