@@ -233,4 +233,4 @@ def inspect(path: Path) -> ModelSheet:
         layout = DetectionNetwork(model).layout
         family, classes = layout.family, layout.names
     provider = str(model.session.get_providers()[0]).removesuffix("ExecutionProvider")
-    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *described, classes=classes)
+    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *[*described, classes])

@@ -24,12 +24,8 @@ def configure(parser: CommandParser) -> None:
     add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
     kinds = [*map(str, EditKind), _AREA, _NO_AREA, _LIST]
     add("kind", choices=kinds, help="what to do; area: name a polygon on the floor; list: print edits and areas")
-    add(
-        "object",
-        nargs="?",
-        default="",
-        help="the object's id, as `gausslite objects` prints it; the number of the edit to undo; the area's name",
-    )
+    object_help = "the object's id, as `gausslite objects` prints it; the number of the edit to undo; the area's name"
+    add("object", nargs="?", default="", help=object_help)
     values_help = (
         "the new noun, the note, the id of the object that is merged into this one, where to split (x=1.25; "
         "without it the middle of the longest side), or the corners X,Y,Z of the area"
