@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from gausslite.datasets.calibration import StatedValues, as_recorded_notes, open
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import describe, require_instance, require_size
+from gausslite.domain.checks import describe, require_instance, require_size, require_types
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -32,6 +33,7 @@ from gausslite.domain.relevance import BallRegion, PointedObject, Region
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import empty_batch
 from gausslite.mission.plan import RunPlan
+from gausslite.mission.runner import ground_truth_notes
 from gausslite.mission.schedule import TaskSchedule
 from gausslite.mission.settings import (
     MissionSettings,
@@ -87,6 +89,7 @@ __all__ = [
     "render_view",
     "save_ply",
 ]
+_PATH, _SEQUENCE = (str, os.PathLike), (tuple, list, ndarray)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +240,8 @@ def map_sequence(
     mapped.result.raise_if_stopped()
     if mapped.result.totals.frames == 0:
         raise mapped.corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
-    notes = (*as_recorded_notes(source), *skipped, *mapped.mapper.notes)
+    truth = ground_truth_notes(source.name, source) if task is not None and plan.perception.model is None else ()
+    notes = (*truth, *as_recorded_notes(source), *skipped, *mapped.mapper.notes)
     return MapResult(mapped.gaussians, mapped.result.summary(), notes)
 
 
@@ -247,11 +251,13 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, world_frame: str = "") -
     world_frame: name of the poses' frame, stored as a comment; `gausslite fuse` refuses maps of different frames.
     Raises StorageError, InvalidInputError.
     """
+    require_types(path=(path, _PATH), gaussians=(gaussians, Gaussians), world_frame=(world_frame, str))
     write_ply(Path(path), gaussians, world_frame)
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Read a map from a 3DGS PLY file; the extra columns may be missing. Raises MapFileError."""
+    """Read a map from a 3DGS PLY file; the extra columns may be missing. Raises MapFileError, InvalidInputError."""
+    require_types(path=(path, _PATH))
     return read_ply(Path(path))
 
 
@@ -268,6 +274,8 @@ def render_view(
     backend: "cpu", "cuda", or "auto" for cuda if it can run, else cpu. threads: of the cpu backend; None
     uses all. Raises PoseError, ShapeError, KernelError.
     """
+    require_types(gaussians=(gaussians, Gaussians), camera=(camera, Camera), backend=(backend, str))
+    require_types(T_world_camera=(T_world_camera, (ndarray, list, tuple)))
     pose = np.asarray(T_world_camera, np.float64)
     require_rigid("T_world_camera", pose)
     image = view_map(gaussians, backend, threads).render(camera, pose)
@@ -283,6 +291,7 @@ def region_on_image(
 
     Raises InvalidInputError for a point outside the image, or a point or box without depth; MissingPluginError.
     """
+    require_types(frame=(frame, Frame), points_px=(points_px, _SEQUENCE), boxes_px=(boxes_px, _SEQUENCE))
     return pointing().region_on_image(frame, points_px, boxes_px)
 
 
@@ -292,6 +301,7 @@ def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> R
     Of frames that measure the same place, this is the nearest. Raises InvalidInputError if none shows the point;
     MissingPluginError.
     """
+    require_types(point_m=(point_m, _SEQUENCE), frames=(frames, Iterable))
     return pointing().region_at(point_m, frames)
 
 
@@ -301,5 +311,8 @@ def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = (
     objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError,
     MissingPluginError.
     """
+    require_types(objects=(objects, Iterable), question=(question, str))
+    listed = list(objects)
+    require_types(**{f"objects[{i}]": (landmark, ObjectLandmark) for i, landmark in enumerate(listed)})
     answer: Callable[[TaskGraph, list[ObjectLandmark], UpAxis], Answer] = load(Group.QUESTIONS, purpose="ask")
-    return answer(DefaultParser().parse(question), list(objects), up_axis)
+    return answer(DefaultParser().parse(question), listed, up_axis)

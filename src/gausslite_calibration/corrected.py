@@ -22,7 +22,7 @@ from gausslite.domain.camera import MAX_READOUT_S, Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.pose import Trajectory, Twist
+from gausslite.domain.pose import Trajectory, Twist, inverse, twist_of
 from gausslite.domain.recording import CameraCorrection
 
 _FIXED_POINT_STEPS = 3
@@ -203,6 +203,22 @@ def _grid_coordinates(width: int, height: int) -> list[Float32[ndarray, "h w"]]:
     return list(np.meshgrid(*sides))
 
 
+_MAX_VELOCITY_CHANGE, _LEAST_GAP_S = 0.5, 1e-6
+
+
+def is_steady(trajectory: Trajectory, i: int) -> bool:
+    """True if the velocities before and after pose i are similar: only then do poses state the velocity there."""
+    times_s, T = trajectory.times_s, trajectory.T_world_camera
+    if not 0 < i < len(times_s) - 1:
+        return False
+    before, after = (
+        twist_of(inverse(T[k]) @ T[k + 1]) / max(float(times_s[k + 1] - times_s[k]), _LEAST_GAP_S) for k in (i - 1, i)
+    )
+    change, mean = after - before, 0.5 * (before + after)
+    limit = _MAX_VELOCITY_CHANGE * Twist(mean[:3], mean[3:]).typical_image_speed
+    return Twist(change[:3], change[3:]).typical_image_speed <= limit
+
+
 _SPEED_QUANTILE = 0.9
 """Frames that turn faster than this share of all frames repeat the image's border in a few pixels."""
 
@@ -246,7 +262,7 @@ class CorrectedSource(WrappedSource):
         recorded = self._source.frame(i)
         correct = correct_frame if self._rectified else undistort_frame
         frame = correct(recorded, self._correction, self._camera, self._trajectory.twist(i))
-        if frame.motion is not None and not self._trajectory.is_steady(i):
+        if frame.motion is not None and not is_steady(self._trajectory, i):
             # a blur along a wrong velocity does more harm than none
             frame = replace(frame, motion=replace(frame.motion, exposure_s=0.0))
         return resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size).in_frame(frame)

@@ -21,7 +21,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, Twist, inverse
 from gausslite.domain.recording import CameraCorrection
-from gausslite_calibration.corrected import correct_frame
+from gausslite_calibration.corrected import correct_frame, is_steady
 from gausslite_calibration.moving_pairs import warp_into
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4
@@ -91,7 +91,7 @@ def _speed_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
     for fast in np.argsort(-speeds).tolist():
         if len(pairs) == _MAX_PAIRS:
             break
-        if any(abs(fast - other) < separation for _, other in pairs) or not trajectory.is_steady(fast):
+        if any(abs(fast - other) < separation for _, other in pairs) or not is_steady(trajectory, fast):
             continue
         cosine = 0.5 * (np.einsum("nij,ij->n", poses[:, :3, :3], poses[fast, :3, :3]) - 1.0)
         is_near = np.linalg.norm(poses[:, :3, 3] - poses[fast, :3, 3], axis=1) < _MAX_DISTANCE_M

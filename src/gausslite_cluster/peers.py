@@ -20,7 +20,7 @@ from gausslite.fusion.traffic import Acknowledgements
 from gausslite.fusion.updates import PendingUpdate, UpdateQueue
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
-from gausslite.wire.channel import open_async_channel
+from gausslite.wire.channel import KEEPALIVE_S, channel_options, connection_options
 from gausslite.wire.security import Tls
 from gausslite.wire.status import from_rpc_error
 from gausslite_cluster.region_host import WAIT_S, RegionHost
@@ -56,6 +56,15 @@ def require_all(parts: Iterable[frozenset[int]], wanted: frozenset[int] = ALL_SL
         raise UnavailableError("fusion server: regions move from one server to another; try again in a moment")
 
 
+def _open_channel(address: str, tls: Tls | None) -> grpc.aio.Channel:
+    """Open a channel for the event loop with the limits of both ends."""
+    own = *connection_options(KEEPALIVE_S), ("grpc.max_reconnect_backoff_ms", 500)
+    options = channel_options(address, tls, own)
+    if tls is None:
+        return grpc.aio.insecure_channel(address, options=options)
+    return grpc.aio.secure_channel(address, tls.client_credentials(), options=options)
+
+
 class Peers:
     """Owns the connections to the servers, also the one to this server itself. Use it on the event loop."""
 
@@ -66,7 +75,7 @@ class Peers:
     def stub(self, server: str) -> Any:
         """Return the methods of a server."""
         if server not in self._connected:
-            channel = open_async_channel(server, self._tls)
+            channel = _open_channel(server, self._tls)
             self._connected[server] = channel, region_pb_grpc.RegionServiceStub(channel)
         return self._connected[server][1]
 

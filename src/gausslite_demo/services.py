@@ -20,7 +20,7 @@ from pathlib import Path
 from gausslite.cli.progress import MappingBar, progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import Plain, to_toml
-from gausslite.config.program import without_options
+from gausslite.config.program import PREFIX
 from gausslite.config.task_parser import DefaultParser
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
@@ -28,10 +28,11 @@ from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region
-from gausslite.mission.recording import calibrate_with_messages, open_recorded, report_region_file, stated_values
+from gausslite.mission.recording import calibrate_with_messages, open_recorded, stated_values
 from gausslite.mission.results import MAP, REPORT_PAGE, require_absent
-from gausslite.mission.runner import FrameStream
+from gausslite.mission.runner import FrameStream, ground_truth_notes
 from gausslite.nouns import meant_by
+from gausslite.process import print_message
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
 STORE = "fusion.sqlite"
@@ -57,6 +58,8 @@ def remove_results(out: Path) -> None:
 
 
 HOME_SIZE = "320x240"
+_SIMD_VARIABLE = "GAUSSLITE_SIMD"
+"""Chooses the instruction set of the kernels, which read it themselves."""
 _HOME = "sim:home?seed={seed}&trajectory={trajectory}&frames={frames}"
 _HOME_FRAMES, _HOME_VIEWS = 120, 24
 _TEST_EVERY = 8
@@ -133,7 +136,8 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     middle = recorded.indices()[len(recorded) // 2]
     first, second = options.frames or f":{middle}", options.frames or f"{middle}:"
     size, regions = frame_size(options.size, recorded), _scored_regions(options, recorded.regions())
-    report_region_file(options.source, recorded)
+    for note in ground_truth_notes(options.source, recorded):
+        print_message(note)
     agents, held_out_positions = [], []
     for letter, task, frames in (("a", options.task_a, first), ("b", options.task_b, second)):
         training, held_out = HeldOutSplit(_TEST_EVERY).split(select_frames(recorded, frames))
@@ -254,6 +258,11 @@ class ProcessGroup:
                     process.wait()
 
 
+def without_options(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment without option variables, for child processes that read their own configuration file."""
+    return {name: text for name, text in environment.items() if not name.startswith(PREFIX) or name == _SIMD_VARIABLE}
+
+
 @contextlib.contextmanager
 def _interrupts_deferred() -> Iterator[None]:
     """Defer interrupts to the end of the block: one between start and registration of a child would orphan it."""
@@ -347,7 +356,7 @@ def watch_missions(services: RunningServices) -> None:
                 with _failure_from_log(service.process), AgentClient(service.address) as client:
                     status = client.status()
                 done = status.frames_mapped + status.frames_skipped + status.frames_dropped + status.frames_rejected
-                bars[agent_id].show(done, status.gaussians, status.roi_share, status.uplink.bytes_sent)
+                bars[agent_id].show(done, status.gaussians, status.roi_share, status.hz, status.uplink.bytes_sent)
                 if is_done(status):
                     del running[agent_id]
     finally:

@@ -20,8 +20,11 @@ from gausslite.domain.errors import ModelFileError
 from gausslite_detectors.class_names import COCO_NAMES, class_count, names_file, names_of, stated_names
 
 Array = ndarray[Any, np.dtype[Any]]
-_YOLO_LINE: Final = "yolo export model=yolo11n-seg.pt format=onnx"
-_RFDETR_LINE: Final = 'python -c "from rfdetr import RFDETRSegNano; RFDETRSegNano().export()"'
+_YOLO_LINE: Final = "export it with Ultralytics (AGPL-3.0): yolo export model=yolo11n-seg.pt format=onnx"
+_FREE_LINE: Final = (
+    "a detector under Apache-2.0 is made with: "
+    'python -c "from rfdetr import RFDETRSegNano; RFDETRSegNano().export()"; `gausslite models list` has others'
+)
 _TASKS: Final = {"pose": "keypoints", "obb": "rotated boxes", "classify": "one class per image",
                  "semantic": "one class per pixel"}  # fmt: skip
 
@@ -121,9 +124,7 @@ def layout_of(outputs: Outputs) -> Layout:
 
 
 def _refusal(outputs: Outputs, what: str, line: str) -> ModelFileError:
-    return ModelFileError(
-        f"model {outputs.path}: expected a detector, got {what}: {outputs.describe()}; export it with: {line}"
-    )
+    return ModelFileError(f"model {outputs.path}: expected a detector, got {what}: {outputs.describe()}; {line}")
 
 
 def _reason(outputs: Outputs) -> tuple[str, str]:
@@ -131,21 +132,22 @@ def _reason(outputs: Outputs) -> tuple[str, str]:
     shapes = [array.shape for array in outputs.arrays]
     count = len(stated_names(outputs.path, outputs.metadata))
     sides = {side for shape in shapes if len(shape) == 2 for side in shape}
+    line = _YOLO_LINE if "ultralytics" in outputs.metadata.get("author", "").lower() else _FREE_LINE
     if len(shapes) >= 3 and all(len(shape) in (3, 4) for shape in shapes):
-        return "the feature maps of a network without its last layers", _YOLO_LINE
+        return "the feature maps of a network without its last layers", line
     if all(len(shape) == 1 for shape in shapes):
-        return "one list of numbers per image, as networks that classify whole images have", _YOLO_LINE
+        return "one list of numbers per image, as networks that classify whole images have", line
     if any(len(shape) == 2 and shape[1] == 5 for shape in shapes) and outputs.named("dets"):
-        return "boxes with scores and labels as MMDeploy writes them", _RFDETR_LINE
+        return "boxes with scores and labels as MMDeploy writes them", line
     if (count and 5 + count in sides) or (not count and 85 in sides):
-        return "boxes with objectness, as YOLOv5 and YOLOX have them", _YOLO_LINE
+        return "boxes with objectness, as YOLOv5 and YOLOX have them", line
     if count and sides:
         fits = f"[1, {4 + count}, A], or [1, {4 + count}+k, A] and [1, k, h, w], or with nms=True [1, n, 6]"
-        return f"outputs that do not fit its {count} class names (expected {fits})", _YOLO_LINE
+        return f"outputs that do not fit its {count} class names (expected {fits})", line
     if sides:
         names = f"{names_file(outputs.path).name} beside it, one name per line"
-        return f"no class names in the metadata field 'names' or in {names}", _YOLO_LINE
-    return "outputs of no known detector", f"{_RFDETR_LINE} or {_YOLO_LINE}"
+        return f"no class names in the metadata field 'names' or in {names}", line
+    return "outputs of no known detector", line
 
 
 def _query_layout(outputs: Outputs) -> Layout | None:
@@ -168,7 +170,7 @@ def _query_layout(outputs: Outputs) -> Layout | None:
         raise _refusal(
             outputs,
             f"no names of its {classes - 1} classes (and one of the background) in the metadata field {names_beside}",
-            "model.export(notes=model.class_names)",
+            "export it with: model.export(notes=model.class_names)",
         )
 
     def decode(arrays: Sequence[Array]) -> Reading:
@@ -343,7 +345,7 @@ def in_pixels(reading: Reading, size_px: tuple[int, int], path: Path) -> Float32
     if np.abs(seen).max(initial=0.0) > _MAX_SIDES * max(size_px) or (seen[:, 2:] < seen[:, :2]).any():
         raise ModelFileError(
             f"model {path}: expected boxes as corners in pixels of {height_px}x{width_px}, or from 0 to 1; got boxes "
-            f"out of range, up to {largest:.0f}; export it with: {_YOLO_LINE}"
+            f"out of range, up to {largest:.0f}; {_FREE_LINE}"
         )
     if largest > _MAX_SHARE:
         return boxes
@@ -377,7 +379,7 @@ class ScoreScale:
         if self._is_percent and high > 101.0:
             raise ModelFileError(
                 f"model {self._path}: expected scores from 0 to 1, logits or percent, got scores out of range, up to "
-                f"{high:.0f}; export it with: {_YOLO_LINE}"
+                f"{high:.0f}; {_FREE_LINE}"
             )
         return np.clip(scores / np.float32(100 if self._is_percent else 1), 0.0, 1.0).astype(np.float32)
 

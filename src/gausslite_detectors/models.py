@@ -119,11 +119,6 @@ VOCABULARY: Final = "vocab.txt"
 OWN_MASKS, DEPTH = "yolo", "depth"
 
 
-def identify_family(model: OpenModel) -> ModelFamily:
-    """Return the family of an open model. Raises ModelFileError if it is not supported."""
-    return _family_of_text(model) or DetectionNetwork(model).layout.family
-
-
 def _family_of_text(model: OpenModel) -> ModelFamily | None:
     """Return the family of a model with texts as an input; None for others, whose outputs decide."""
     from gausslite_detectors.open_vocabulary import is_grounding, is_prompted
@@ -223,16 +218,19 @@ class ModelSheet:
     provider: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    classes: tuple[str, ...]  # "" for an index without a name; empty for texts as queries
 
 
 def inspect(path: Path) -> ModelSheet:
     """Return the description of a model. Raises ModelFileError if it is damaged or of no known family."""
     model = open_model(path, threads=1)
-    session = model.session
     described = [
         tuple(f"{port.name} {port.shape} {port.type.removeprefix('tensor').strip('()')}" for port in side)
-        for side in (session.get_inputs(), session.get_outputs())
+        for side in (model.session.get_inputs(), model.session.get_outputs())
     ]
-    family = identify_family(model)
-    provider = str(session.get_providers()[0]).removesuffix("ExecutionProvider")
-    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *described)
+    family, classes = _family_of_text(model), tuple[str, ...]()
+    if family is None:
+        layout = DetectionNetwork(model).layout
+        family, classes = layout.family, layout.names
+    provider = str(model.session.get_providers()[0]).removesuffix("ExecutionProvider")
+    return ModelSheet(path, path.stat().st_size, sha256_of(path), family, provider, *[*described, classes])

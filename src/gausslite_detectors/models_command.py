@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 
 from gausslite.config.values import read_path
 
@@ -14,7 +15,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     source = actions.add_parser("source", help="print where a file comes from, its licence, and how to export it")
     source.add_argument("name", metavar="NAME", help="a name that `gausslite models list` prints")
     source.set_defaults(run=_source)
-    inspect = actions.add_parser("inspect", help="print a model's family, inputs and outputs")
+    inspect = actions.add_parser("inspect", help="print a model's family, inputs, outputs and classes")
     inspect.add_argument("file", metavar="FILE.onnx", type=read_path)
     inspect.set_defaults(run=_inspect)
 
@@ -45,4 +46,6 @@ def _inspect(options: argparse.Namespace) -> int:
     for label, tensors in (("input", description.inputs), ("output", description.outputs)):
         for tensor in tensors:
             print(f"{label:9} {tensor}")
+    if names := [name for name in description.classes if name]:
+        print(textwrap.fill(f"classes   {len(names)}: {', '.join(names)}", 100, subsequent_indent=" " * 10))
     return 0

@@ -19,7 +19,7 @@ from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of, twist_of
-from gausslite.mission.results import map_file, stated_up
+from gausslite.mission.results import map_file
 from gausslite.process import import_extra, print_message
 from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
 from gausslite_export.mesh import write_mesh
@@ -28,6 +28,7 @@ from gausslite_export.occupancy import (
     NO_VOXELS,
     FloorGrid,
     OccupancySettings,
+    near_middle,
     occupied_voxels,
     planar_grid,
     require_voxels,
@@ -39,7 +40,7 @@ from gausslite_export.rerun_file import write_rrd
 from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, SPZ_VERSION, write_gltf, write_packed
 from gausslite_export.surface_votes import SurfaceVotes, count_votes, rendered_depths
 from gausslite_export.video import write_video
-from gausslite_objects.visit import depth_views, read_depths
+from gausslite_objects.visit import depth_views, read_depths, stated_up
 from gausslite_render.harmonics import rotated
 from gausslite_render.splat_map import read_splats
 
@@ -128,7 +129,6 @@ def read_map(
             f"{max_extent_m:g} m, got larger ones",
         )
     total = len(stored.gaussians) + stored.left_out
-    kept = harmonics if harmonics.any() else None
     return MapContent(
         gaussians=gaussians,
         chosen=chosen,
@@ -138,7 +138,7 @@ def read_map(
         views=views,
         depths_m=depths_m,
         report=report,
-        harmonics=kept,
+        harmonics=harmonics if harmonics.any() else None,
     )
 
 
@@ -149,9 +149,7 @@ def upright(content: MapContent) -> MapContent:
     angle_rad = float(np.linalg.norm(turn_rad))
     if angle_rad == 0.0:
         return content
-    about, shown = (
-        ",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (turn_rad / angle_rad, up)
-    )
+    about, shown = (",".join(f"{value + 0.0:.3g}" for value in np.round(v, 3)) for v in (turn_rad / angle_rad, up))
     note = (
         f"up is {shown} in the map: it is turned by {np.degrees(angle_rad):.1f} deg about {about}, so that z points up"
     )
@@ -204,29 +202,12 @@ def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
-_OUTLIER_FACTOR, _LEAST_REACH_M = 20.0, 20.0
-
-
 def _without_outliers(content: MapContent) -> MapContent:
-    """Return the map without what lies, or reaches, 20 times as far from its middle as 99 % of it, with a message.
-
-    The cells of a grid cover all that is between; a single Gaussian of a wrong measurement would decide their number.
-    """
-    middle_m = np.median(content.chosen.means_m, axis=0)
-
-    def reach_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
-        largest: Float32[ndarray, " n"] = np.abs(gaussians.means_m - middle_m).max(axis=1) + gaussians.scales_m.max(
-            axis=1
-        )
-        return largest
-
-    reaches_m = reach_m(content.chosen)
-    limit_m = max(_LEAST_REACH_M, _OUTLIER_FACTOR * float(np.percentile(reaches_m, 99)))
-    far = int(np.count_nonzero(reaches_m > limit_m))
-    if far:
+    """Return the map without what is not `near_middle`, with a message."""
+    (near, limit_m), (chosen, _) = (near_middle(part, content.chosen) for part in (content.gaussians, content.chosen))
+    if far := int(np.count_nonzero(~chosen)):
         print_message(f"left out {far} Gaussians that lie or reach farther than {limit_m:.0f} m from the map's middle")
-    kept = content.gaussians.take(reach_m(content.gaussians) <= limit_m)
-    return replace(content, gaussians=kept, chosen=content.chosen.take(reaches_m <= limit_m))
+    return replace(content, gaussians=content.gaussians.take(near), chosen=content.chosen.take(chosen))
 
 
 def _octomap(path: Path, content: MapContent, settings: ExportSettings) -> None:
@@ -243,6 +224,17 @@ def _distances(path: Path, content: MapContent, settings: ExportSettings) -> Non
 
 
 def _floor_grid(content: MapContent, settings: ExportSettings) -> FloorGrid:
+    """Return the grid; say where its floor lies in the map's frame, which objects and areas have."""
+    grid = _grid(content, settings)
+    T = grid.T_map_grid
+    *normal, height_m = (round(float(value), 3) + 0.0 for value in (*T[:3, 2], T[:3, 2] @ T[:3, 3]))
+    plane = " + ".join(f"{value} {axis}" for value, axis in zip(normal, "xyz", strict=True) if value)
+    turned = "" if normal == [0, 0, 1] else "; the grid is turned: p_map = T_map_grid p_grid, which the file has"
+    print_message(f"the floor is where {plane} = {height_m} m in the map's frame, that of objects and areas{turned}")
+    return grid
+
+
+def _grid(content: MapContent, settings: ExportSettings) -> FloorGrid:
     """Return the grid of what depth images show around the chosen Gaussians; without keyframes, of the Gaussians."""
     content, occupancy = _without_outliers(content), _occupancy(settings)
     if not content.views:

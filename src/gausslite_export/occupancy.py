@@ -42,6 +42,7 @@ _SEEN_M, _SEEN_SHARE, _LOWEST_M = 0.9, 0.3, 0.3
 """A cell without an obstacle is free if images show its floor or see through one of its voxels in the lowest 0.3 m of
 the heights, and see through 30 % of the lowest 0.9 m: over the unseen half of an ottoman they see higher ones only."""
 _SPECK_CELLS = 4
+_OUTLIER_FACTOR, _LEAST_REACH_M = 20.0, 20.0
 NO_VOXELS: Int64[ndarray, "0 3"] = np.zeros((0, 3), np.int64)
 
 
@@ -56,6 +57,19 @@ class OccupancySettings:
     voxel_m: float = 0.05
     min_opacity: float = 0.3
     height_m: tuple[float, float] = (0.1, 1.8)
+
+
+def near_middle(gaussians: Gaussians, chosen: Gaussians) -> tuple[Bool[ndarray, " n"], float]:
+    """Return what lies and reaches at most 20 times as far from the middle as 99 % of the chosen, and how far that is.
+
+    The cells of a grid cover all that is between; a single Gaussian of a wrong measurement would decide their number.
+    """
+    middle_m = np.median(chosen.means_m, axis=0)
+    reaches_m, chosen_m = (
+        np.abs(part.means_m - middle_m).max(axis=1) + part.scales_m.max(axis=1) for part in (gaussians, chosen)
+    )
+    limit_m = max(_LEAST_REACH_M, _OUTLIER_FACTOR * float(np.percentile(chosen_m, 99)))
+    return reaches_m <= limit_m, limit_m
 
 
 def occupied_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:

@@ -18,12 +18,12 @@ from numpy import ndarray
 from gausslite.codec.ply import SH_C0, ply_bytes
 from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.frame import linear_light
 from gausslite.domain.gaussians import Gaussians
 from gausslite.process import import_extra
 from gausslite_export.format import MapContent
 from gausslite_render.harmonics import COUNTS
 from gausslite_render.viewer import by_place
+from gausslite_selection.colours import linear_light
 
 SPZ_VERSION, SPZ_VERSIONS = 3, (2, 3, 4)
 _HALF = np.float32(0.5 / 255)

@@ -30,7 +30,6 @@ _STOREY_M = (-0.3, 2.7)
 _BEFORE: Final = r"(?:^|\b(?:in|inside|at|within|from|(?P<out>not (?:in|inside|at)|outside(?: of)?|out of))\s+)"
 _AFTER: Final = r"(?=\s*(?:$|[?.,!]|(?:on|near|and|or|that|which|with|is|are|there|by|next|under|beside|behind|in)\b))"
 """Around the name of an area: the kitchen table is no place in the kitchen."""
-
 _EVERYTHING: Final = {"", "what is", "what's", "what is there", "what", "list", "show", "everything", "all", "objects"}
 
 _IN: Final = (Predicate.INSIDE, Predicate.ON)

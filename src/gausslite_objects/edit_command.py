@@ -26,19 +26,13 @@ def configure(parser: CommandParser) -> None:
     )
     kinds = [*map(str, EditKind), _AREA, _NO_AREA, _LIST]
     add("kind", choices=kinds, help="what to do; area: name a polygon on the floor; list: print edits and areas")
-    add(
-        "object",
-        nargs="?",
-        default="",
-        help="the object's id, as `gausslite objects` prints it; the number of the edit to undo; the area's name",
+    object_help = "the object's id, as `gausslite objects` prints it; the number of the edit to undo; the area's name"
+    add("object", nargs="?", default="", help=object_help)
+    values_help = (
+        "the new noun, the note, the id of the object that is merged into this one, where to split (x=1.25; "
+        "without it the middle of the longest side), or the corners X,Y,Z of the area"
     )
-    add(
-        "values",
-        nargs="*",
-        metavar="VALUE",
-        help="the new noun, the note, the id of the object that is merged into this one, where to split (x=1.25; "
-        "without it the middle of the longest side), or the corners X,Y,Z of the area, after -- if one is negative",
-    )
+    add("values", nargs="*", metavar="VALUE", help=values_help)
     add("--author", default=getpass.getuser(), help="who edits (default: %(default)s)")
     add_flags(parser, TlsFiles)
     parser.set_defaults(run=run)
@@ -60,8 +54,8 @@ def run(options: argparse.Namespace) -> int:
         memory.remove_area(options.object)
         print(f"area {quote_name(options.object)}: removed")
     else:
-        value = " ".join(options.values)
-        print(memory.edit(EditKind(options.kind), options.object, value, options.author).describe())
+        edit = memory.edit(EditKind(options.kind), options.object, " ".join(options.values), options.author)
+        print(edit.describe())
     return 0
 
 

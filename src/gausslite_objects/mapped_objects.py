@@ -18,7 +18,7 @@ from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.objects import Answer, ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import Predicate, TaskGraph
-from gausslite.mission.results import MAP, TRAJECTORY, read_report, stated_up
+from gausslite.mission.results import MAP, TRAJECTORY, read_report
 from gausslite.plugins import Group, load
 from gausslite.wire.security import Tls
 from gausslite_language.rules import RuleParser
@@ -27,7 +27,7 @@ from gausslite_objects.edits import EditedObjects, apply_edits, read_edits
 from gausslite_objects.life import Life, life_of
 from gausslite_objects.object_memory import ObjectMemory, RunMemory, reported_objects
 from gausslite_objects.team_objects import merge_objects
-from gausslite_objects.visit import Visit, depth_views, read_depths
+from gausslite_objects.visit import Visit, depth_views, read_depths, stated_up
 
 
 @dataclass(frozen=True, slots=True)

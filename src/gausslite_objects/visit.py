@@ -15,11 +15,11 @@ from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera, back_project
-from gausslite.domain.errors import MapFileError
+from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import without_depth_edges
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.pose import inverse, transform_points
+from gausslite.domain.pose import UpAxis, inverse, transform_points, unit_up_axis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.free_space import REDUCED_WIDTH_PX, DepthView, view_counts
 from gausslite_objects.keyframe_depths import read_keyframe_depths
@@ -132,6 +132,16 @@ def read_depths(folder: Path, keyframes: Sequence[KeyframeView]) -> dict[int, Fl
         if depth_m is not None and depth_m.shape[::-1] != size:
             raise MapFileError(f"{folder}: expected depth of {size} pixels for keyframe {view.index}, got another size")
     return depths_m
+
+
+def stated_up(report: Mapping[str, object]) -> UpAxis | None:
+    """Return the upward direction in the map's frame; None if the report states none. Raises InvalidInputError."""
+    if (stated := report.get("up")) is None:
+        return None
+    numbers = [value for value in stated if isinstance(value, int | float)] if isinstance(stated, list) else []
+    if len(numbers) != 3:
+        raise InvalidInputError(f"report.json: up: expected three numbers, got {stated!r}")
+    return unit_up_axis((numbers[0], numbers[1], numbers[2]))
 
 
 def depth_views(

@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.datasets.files import load_rgbd
 from gausslite.datasets.folder import FolderSource, Origin, is_lost
 from gausslite.datasets.pose_track import nearest_rigid
-from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import excluded_frames_note, require_position
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
@@ -101,3 +101,9 @@ class NumberedFolderSource(FolderSource):
             return not is_lost(T[:3, 3], T[:3, :3])
         except (DatasetError, PoseError):
             return False
+
+
+def require_frames(folder: Path, count: int, expected: str) -> None:
+    """Raise DatasetError if the sequence has no frames."""
+    if count == 0:
+        raise DatasetError(f"{folder}: expected {expected}, got none")

@@ -27,12 +27,13 @@ from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.files import DepthUnits, RgbdImage, decode_image, require_pixel_count, resize_depth, resize_rgbd
 from gausslite.datasets.folder import FolderReader, FolderSource, estimate_up, is_lost
 from gausslite.datasets.pose_track import pose_from_quaternion
-from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import excluded_frames_note, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.file_formats import foreign_file
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
+from gausslite_recorders.numbered_folder import require_frames
 
 METADATA = "metadata"
 _COLOUR_NAME = re.compile(r"rgbd/(\d{1,7})\.jpg")

@@ -15,6 +15,7 @@ import zstandard
 
 from gausslite.codec.ply import StoredMap, read_stored_map
 from gausslite.domain.errors import MapFileError
+from gausslite.domain.file_formats import foreign_file
 from gausslite.mission.results import map_file
 from gausslite_render.packed_splats import (
     MAX_GAUSSIANS,
@@ -28,6 +29,7 @@ from gausslite_render.packed_splats import (
 from gausslite_render.sog import decode_sog
 
 _DECODERS = {".splat": decode_splat, ".spz": decode_spz, ".sog": decode_sog, ".ksplat": decode_ksplat}
+_OWN_FORMATS = {".spz": "an SPZ map", ".sog": "a zip archive; unpack it first", ".ply": "a PLY map"}
 _MAX_BYTES = MAX_GAUSSIANS * 62 * 4
 _HEADER_BYTES, _FINITE = 1 << 12, "finite values"
 _DAMAGED = (
@@ -73,11 +75,17 @@ def _decoded(file: Path, decode: Callable[[bytes], Splats]) -> StoredMap:
         kept = np.logical_and.reduce(list(finite))
         require(bool(kept.any()), _FINITE, "NaN or infinity")
     except MapFileError as error:
-        raise MapFileError(f"{file}: {error}") from error
+        raise MapFileError(f"{file}: {_foreign(file) or error}") from error
     except _DAMAGED as error:
-        cause = " ".join(str(error).split())[:150]
-        raise MapFileError(f"{file}: expected a whole {file.suffix} file, got a damaged one: {cause}") from error
+        damaged = f"expected a whole {file.suffix} file, got a damaged one: {' '.join(str(error).split())[:150]}"
+        raise MapFileError(f"{file}: {_foreign(file) or damaged}") from error
     if kept.all():
         return StoredMap(gaussians, "", harmonics)
     reason = f"expected {_FINITE}, got NaN or infinity"
     return StoredMap(gaussians.take(kept), "", harmonics[kept], int(np.count_nonzero(~kept)), reason)
+
+
+def _foreign(file: Path) -> str:
+    """Return that a file has another format than its suffix says; empty if that is not known."""
+    found, suffix = foreign_file(file), file.suffix.lower()
+    return "" if found in ("", _OWN_FORMATS.get(suffix)) else f"expected a {suffix} file, got {found}"

@@ -11,7 +11,7 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.free_space import DepthView
-from gausslite_export.occupancy import FloorGrid, OccupancySettings, occupied_voxels, planar_grid
+from gausslite_export.occupancy import FloorGrid, OccupancySettings, near_middle, occupied_voxels, planar_grid
 from gausslite_export.surface_votes import SurfaceVotes
 from gausslite_link.map_follower import FollowedMap
 
@@ -55,7 +55,8 @@ class LiveMap:
         if newest is None or not len(newest.batch.gaussians):
             return None
         gaussians = newest.batch.gaussians
-        voxels = occupied_voxels(gaussians, self._settings)
+        # those of a teammate, or of a wrong measurement, may be anywhere
+        voxels = occupied_voxels(gaussians.take(near_middle(gaussians, gaussians)[0]), self._settings)
         if not len(voxels):
             return None
         voxels = self._votes.without_contradicted(voxels)

@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.frame import Frame, linear_light
+from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.selector import Fit
 from gausslite_selection.words import words
@@ -141,6 +141,11 @@ def _range_shares(rgb: Float64[ndarray, "n 3"]) -> Float64[ndarray, " ranges"]:
         shares[index] = np.count_nonzero(is_inside)
         is_free &= ~is_inside
     return shares / max(len(rgb), 1)
+
+
+def linear_light(encoded: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+    """Return sRGB colours in [0, 1] as linear light in [0, 1], in the same precision (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _oklab(

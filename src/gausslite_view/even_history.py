@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -42,19 +42,16 @@ class EvenHistory(Generic[_State]):
         return tuple(self._states)
 
     def is_due(self, time_ns: int) -> bool:
-        """Return True if a state of this time would be evenly spaced, or begins a new history with an earlier time."""
+        """Return True if a state of this time would be evenly spaced, or replaces later ones."""
         if not self._times_ns or time_ns < self._times_ns[-1]:
             return True
         gap_ns, span_ns = time_ns - self._times_ns[-1], self._times_ns[-1] - self._times_ns[0]
         return gap_ns >= self.least_gap_ns and gap_ns * self.capacity >= span_ns
 
     def add(self, time_ns: int, state: _State) -> None:
-        """Add the newest state. One earlier than the newest replaces the whole history; one of its time replaces it."""
-        if self._times_ns and time_ns < self._times_ns[-1]:
-            self._times_ns, self._states = [], []
-        elif self._times_ns and time_ns == self._times_ns[-1]:
-            self._states[-1] = state
-            return
+        """Add the newest state. It replaces those of its time and later ones, as after a restart."""
+        first_later = bisect_left(self._times_ns, time_ns)
+        del self._times_ns[first_later:], self._states[first_later:]
         self._times_ns.append(time_ns)
         self._states.append(state)
         if len(self._times_ns) > self.capacity:

@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.mission.results import read_evaluation, read_report
+from gausslite.mission.results import EVALUATION, read_json, read_report
 from gausslite.process import print_message, size_text
 from gausslite_evaluation.compare import TEAM_MAP
 from gausslite_evaluation.lpips import NAME as LPIPS_NAME
@@ -85,6 +85,15 @@ def read_results(folders: Sequence[Path]) -> ReportContents:
     return ReportContents(names, runs, sheets)
 
 
+def _read_evaluation(folder: Path) -> Mapping[str, object]:
+    """Return the content of evaluation.json; empty without it. Raises MapFileError for a damaged file."""
+    path = folder / EVALUATION
+    scores = read_json(path)
+    if not scores and path.exists():
+        raise MapFileError(f"{path}: expected the scores of `gausslite eval`, got something else")
+    return scores
+
+
 def _read_run(folder: Path, name: str, scores: Mapping[str, object] | None = None) -> RunResults:
     report, file = read_report(folder), folder / _MAP
     if not report and (folder / "report.json").exists():
@@ -92,7 +101,7 @@ def _read_run(folder: Path, name: str, scores: Mapping[str, object] | None = Non
     notes = []
     if scores is None:
         try:
-            scores = read_evaluation(folder)
+            scores = _read_evaluation(folder)
         except MapFileError as error:
             scores = {}
             notes.append(f"{error}; the page has no scores of it")

@@ -12,9 +12,9 @@ from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera, lift, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.pose import Twist, inverse, transform_points
+from gausslite.domain.pose import Trajectory, Twist, inverse, transform_points
 from gausslite.domain.recording import CameraCorrection
-from gausslite_calibration.corrected import CorrectedSource, correct_frame, ideal_camera
+from gausslite_calibration.corrected import CorrectedSource, correct_frame, ideal_camera, is_steady
 
 CAMERA = Camera(160.0, 160.0, 100.0, 75.0, 200, 150)
 STILL = Twist(np.zeros(3), np.zeros(3))
@@ -130,3 +130,10 @@ def test_exposure_time_becomes_the_frames_motion() -> None:
     assert (motion.readout_s, motion.exposure_s, motion.twist) == (0.0, 0.01, twist)
     assert correct_frame(frame, CameraCorrection(readout_s=0.02), CAMERA, twist).motion is None
     assert CameraCorrection.parse(str(correction)) == correction
+
+
+def test_a_velocity_is_steady_if_it_is_similar_before_and_after() -> None:
+    poses = np.repeat(np.eye(4)[None], 5, axis=0)
+    poses[:, 0, 3] = [0.0, 0.1, 0.2, 0.3, 0.31]
+    trajectory = Trajectory(np.arange(5) / 10, poses)
+    assert [is_steady(trajectory, i) for i in range(5)] == [False, True, True, False, False]

@@ -40,6 +40,7 @@ WRONG: dict[str, Change] = {
     "depth images mirrored": lambda f: replace(f, depth_m=np.ascontiguousarray(f.depth_m[:, ::-1])),
     "focal length multiplied by": half_size,
 }
+REST = np.eye(4)
 
 
 def streamed(frames: list[Frame], change: Change = lambda frame: frame) -> Iterator[tuple[int, str]]:
@@ -57,6 +58,28 @@ def test_wrong_frames_are_refused_with_what_would_agree(frames: list[Frame], rea
     refused = dict(streamed(frames, WRONG[reason]))
     assert reason in refused[len(frames) - 1]
     assert "--set force=true" in refused[len(frames) - 1]
+
+
+def test_poses_that_never_change_are_refused_and_a_camera_at_rest_is_not(frames: list[Frame]) -> None:
+    moving = list(streamed(frames, lambda frame: replace(frame, T_world_camera=REST)))
+    assert "do not fit the images" in moving[-1][1]
+    noise = np.random.default_rng(1)
+
+    def at_rest(frame: Frame) -> Frame:
+        rgb = np.clip(frames[0].rgb + noise.normal(0, 8, frames[0].rgb.shape), 0, 255).astype(np.uint8)
+        return replace(frame, rgb=rgb, depth_m=frames[0].depth_m, T_world_camera=REST)
+
+    assert not any(reason for _, reason in streamed(frames, at_rest))
+
+
+def test_unregistered_depth_is_named_once_and_mapped(frames: list[Frame]) -> None:
+    check, notes = LiveCheck(False), set[str]()
+    for frame in frames * 3:
+        assert check.refusal(replace(frame, camera=frame.camera.zoomed(1.24))) == ""
+        notes.update(check.notes)
+    (note,) = notes
+    assert "not registered to the colour image" in note
+    assert "gausslite calibrate" in note
 
 
 def test_frames_are_mapped_again_when_they_are_corrected(frames: list[Frame]) -> None:

@@ -13,7 +13,15 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_agent.settings import parse_arguments
-from gausslite_demo.services import AgentPlan, DemoPlan, RunningService, RunningServices, ServiceProcess, watch_missions
+from gausslite_demo.services import (
+    AgentPlan,
+    DemoPlan,
+    RunningService,
+    RunningServices,
+    ServiceProcess,
+    watch_missions,
+    without_options,
+)
 
 
 def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
@@ -49,3 +57,8 @@ def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path
     assert settings.perception == replace(
         perception, threads=threads, asynchronous=at_rate, detection_time_s=detection_time_s
     )
+
+
+def test_a_child_process_inherits_no_option_variables() -> None:
+    environment = {"PATH": "/bin", "GAUSSLITE_OUT": "x", "GAUSSLITE_SIMD": "avx2"}
+    assert without_options(environment) == {"PATH": "/bin", "GAUSSLITE_SIMD": "avx2"}

@@ -174,6 +174,7 @@ def test_what_is_unknown_is_refused_by_name(tmp_path, name):
     with pytest.raises(ModelFileError, match=expected) as caught:
         detector_of(tmp_path, *parts)
     assert "\n" not in str(caught.value)
+    assert ("AGPL" in str(caught.value)) is (name in ("pose", "rotated"))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ def test_the_command_lists_and_inspects(tmp_path, capsys):
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [entry.name for entry in CATALOGUE]
     assert main(["models", "inspect", str(path)]) == 0
     printed = capsys.readouterr().out
-    for expected in ("YOLO-seg or FastSAM", "images [1, 3, 64, 64] float", "CPU"):
+    for expected in ("YOLO-seg or FastSAM", "images [1, 3, 64, 64] float", "CPU", "classes   1: cup\n"):
         assert expected in printed
     path.write_bytes(path.read_bytes()[:-1])
     assert main(["models", "inspect", str(path)]) == 2

@@ -17,7 +17,7 @@ from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.boxes import SegmentedDetector
 from gausslite_detectors.layouts import ModelFamily
 from gausslite_detectors.model_file import choose_providers, open_model
-from gausslite_detectors.models import READER, identify_family
+from gausslite_detectors.models import READER, inspect
 from gausslite_detectors.tiles import TiledDetector
 
 # in the network's pixels; in the image columns 32 to 64, rows 16 to 48
@@ -47,14 +47,14 @@ def found_pixels(detector: Detector) -> int:
 
 def test_a_family_is_identified_by_inputs_and_outputs(tmp_path):
     grounding = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
-    assert identify_family(open_model(grounding, 1)) is ModelFamily.GROUNDING_DINO
-    assert identify_family(open_model(yolo(tmp_path), 1)) is ModelFamily.YOLO_SEG
+    assert inspect(grounding).family is ModelFamily.GROUNDING_DINO
+    assert inspect(yolo(tmp_path)).family is ModelFamily.YOLO_SEG
     boxes = write_boxes_only(tmp_path / "boxes.onnx", ("cup", "chair"), [CUP])
-    assert identify_family(open_model(boxes, 1)) is ModelFamily.YOLO_BOXES
+    assert inspect(boxes).family is ModelFamily.YOLO_BOXES
     # rows of box, objectness and classes, as other detectors have them
     other = write_boxes_only(tmp_path / "other.onnx", ("cup", "chair"), [CUP], more_rows=1)
     with pytest.raises(ModelFileError, match="expected a detector, got boxes with objectness, as YOLOv5 and YOLOX"):
-        identify_family(open_model(other, 1))
+        inspect(other)
 
 
 def test_boxes_with_class_names_get_masks_from_depth(tmp_path):

@@ -16,7 +16,7 @@ from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
 from gausslite_detectors.layouts import ModelFamily
 from gausslite_detectors.model_file import open_model
-from gausslite_detectors.models import READER, identify_family
+from gausslite_detectors.models import READER, inspect
 from gausslite_detectors.open_vocabulary import PromptedYolo
 from gausslite_detectors.text_features import ClipTextEncoder, NounVectorTable
 
@@ -125,7 +125,7 @@ def test_a_table_of_text_vectors_replaces_the_encoder(tmp_path):
 
 def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):
     path = write_prompted(tmp_path / "world.onnx", BOXES, anchors(), 81)
-    assert identify_family(open_model(path, 1)) is ModelFamily.PROMPTED_YOLO
+    assert inspect(path).family is ModelFamily.PROMPTED_YOLO
     encoder(tmp_path)
     found = opened(path).detect(frame(), ["mug"])
     assert found[0].box_px == pytest.approx((32, 16, 64, 48), abs=1e-4)

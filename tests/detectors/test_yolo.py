@@ -11,6 +11,7 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import found_text
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector_file import DetectorOptions
@@ -191,6 +192,8 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     once.estimate(frames[0])
     assert once.objects == ()
     assert once.nouns[0].describe().endswith("none confirmed, which takes two moments or places")
+    missing = found_text((), ("laptop",), np.zeros((0, 3), np.float32), once.nouns)
+    assert missing == "no laptop (1 detections, best score 0.40, none confirmed, which takes two moments or places)"
     restored = TaskRelevanceEstimator(task, detector)
     restored.restore(strict.state())
     assert restored.nouns == strict.nouns

@@ -1,6 +1,7 @@
 """Free cells of an exported room: seen floor and air are free, walls are occupied, what lies behind them is unknown."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import cv2
@@ -89,17 +90,21 @@ def test_needles_of_gaussians_are_no_obstacles_and_measured_depth_comes_before_t
     assert (cells == plain).all()
 
 
-def test_distances_to_obstacles_have_the_pose_of_their_grid(tmp_path):
+def test_distances_to_obstacles_have_the_pose_of_their_grid(tmp_path, capsys):
     gaussians = room()
     T_map_upright = transform_of(np.array([1.0, 2.0, 3.0, 0.0, np.pi / 2, 0.0]))
     content = MapContent(gaussians, gaussians, views=VIEWS, T_upright_map=inverse(T_map_upright))
     found = np.load(export(tmp_path, "esdf", content))
+    floor = re.search(r"the floor is where (\S+) x = (\S+) m in .* p_map = T_map_grid p_grid", capsys.readouterr().err)
     row, column = (int((1.25 - low) / VOXEL_M) for low in found["origin_m"])
     assert found["cells"][row, column] == FREE
     assert found["distance_m"][row, column] == pytest.approx(0.8, abs=0.11)
     assert found["distance_m"][found["cells"] == OCCUPIED].max() == 0
     in_map_m = transform_points(found["T_map_grid"], np.array([1.25, 1.25, 0.0]))
     np.testing.assert_allclose(transform_points(inverse(T_map_upright), in_map_m), (1.25, 1.25, 0.0), atol=0.11)
+    assert float(floor[1]) * in_map_m[0] == pytest.approx(float(floor[2]), abs=2e-3)
+    export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=VIEWS))
+    assert "the floor is where 1.0 z = " in capsys.readouterr().err
 
 
 def test_a_thin_surface_stays_where_most_images_see_past_it_and_one_error_is_none():

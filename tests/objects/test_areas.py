@@ -52,7 +52,7 @@ def test_areas_are_named_by_command_asked_for_carried_and_removed(
     box = {"centroid_m": [5.0, 5.0, 1.0], "min_m": [4.9, 4.9, 0.9], "max_m": [5.1, 5.1, 1.1]}
     elsewhere = {**MUG, "id": "mug-2", **box}
     run = write_run(tmp_path / "run", objects=[MUG, elsewhere], up=[0.0, 0.0, 1.0])
-    assert main(["edit", str(run), "area", "kitchen", *SQUARE]) == 0
+    assert main(["edit", str(run), "area", "kitchen", "-1,-.5,0", *SQUARE[1:]]) == 0
     assert main(["edit", str(run), "area", "Kitchen", *SQUARE]) == 0
     assert [area.name for area in read_areas(run)] == ["Kitchen"]
     for question, ids in (("mug in the kitchen", ["mug-1"]), ("what is outside the kitchen", ["mug-2"])):

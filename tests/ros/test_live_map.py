@@ -73,3 +73,11 @@ def test_each_range_of_heights_has_its_obstacles() -> None:
 
 def test_before_the_agent_has_a_map_there_are_no_messages() -> None:
     assert LiveMap(lambda: None, OccupancySettings(CELL_M), ((0.1, 0.9),)).update() is None
+
+
+def test_one_gaussian_far_away_does_not_end_the_grids() -> None:
+    points_m = [*WALL_M, [9e4, 0.0, 0.5]]
+    far = FollowedMap(1, group_by_voxel(plain_gaussians(points_m, opacities=0.9), VoxelGrid(0.1)), {})
+    contents = LiveMap(lambda: far, OccupancySettings(CELL_M), ((0.1, 0.9),)).update()
+    assert contents is not None
+    assert at(contents.grids[0], 2.05, 0.05) == OCCUPIED

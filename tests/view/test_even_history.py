@@ -46,14 +46,15 @@ def test_the_state_at_a_time_is_the_newest_before_it():
     assert [history.at(time_ns) for time_ns in (0, 10, 19, 20, 99)] == ["a", "a", "a", "b", "b"]
 
 
-def test_a_state_of_the_same_time_replaces_and_an_earlier_one_begins_again():
+def test_a_state_replaces_those_of_its_time_and_later_ones():
     history: EvenHistory[str] = EvenHistory(4)
     for time_ns, state in ((10, "a"), (20, "b"), (20, "c")):
         history.add(time_ns, state)
     assert history.states == ("a", "c")
-    assert history.is_due(5)
-    history.add(5, "d")
-    assert history.states == ("d",)
+    for time_ns, states in ((15, ("a", "d")), (5, ("d",))):
+        assert history.is_due(time_ns)
+        history.add(time_ns, "d")
+        assert history.states == states
 
 
 def test_a_history_that_keeps_no_state_between_its_ends_is_refused() -> None:

@@ -102,7 +102,7 @@ class AgentMission:
 
         can_find: False if any task would fail. source_notes: messages on the recording.
         """
-        self.can_find, self._source_notes, self._save_failure = can_find, source_notes, ""
+        self.can_find, self._source_notes, self._save_failure, self._last_reason = can_find, source_notes, "", ""
         self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
         self._up_axis = settings.up_axis or (0.0, 0.0, 1.0)
         self._state_machine = MissionStateMachine()
@@ -297,8 +297,9 @@ class AgentMission:
         if pending is None:
             return
         report = pending.result()
-        if report.reason:
+        if report.reason not in ("", self._last_reason, *self._worker.status().notes):
             _log.info("frame %d %s: %s", report.index, report.outcome.value, report.reason)
+        self._last_reason = report.reason
 
     def _end(self, request: EndRequest, ended_by: str | None) -> MissionSummary:
         """End the mission once, by `end`'s request if there is one; ended_by: the error that ended it early."""

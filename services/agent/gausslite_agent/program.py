@@ -23,7 +23,7 @@ from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.mission.plan import RunPlan
 from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.results import locked_folder, prepare_file
-from gausslite.mission.runner import FrameStream, region_file_note
+from gausslite.mission.runner import FrameStream, ground_truth_notes
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.pages import load_pages
 from gausslite.plugins import Group, installed, load
@@ -220,8 +220,7 @@ def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: Prio
     if settings.task is not None:
         estimators.require_detector()
     if settings.source is not None and stream is not None and settings.perception.model is None:
-        note = region_file_note(settings.source.spec, stream.source)
-        if note is not None:
+        for note in ground_truth_notes(settings.source.spec, stream.source):
             _log.info(note)
     return estimators
 

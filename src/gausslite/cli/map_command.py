@@ -332,7 +332,7 @@ def _print_results(options: argparse.Namespace, mapped: MappedRun, written: _Wri
     in_region = f" ({active:,} in the task's region)" if active or mapped.run.scheduled.schedule.graphs() else ""
     shown = "" if written.scores is None else f"; {PREVIEW} in the same folder shows it"
     print(
-        f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
+        f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {totals.hz:.1f} Hz, "
         f"{len(mapped.gaussians):,} Gaussians{in_region} → {options.out / 'map.ply'}{shown}"
     )
     if totals.late:
@@ -351,9 +351,9 @@ def _print_results(options: argparse.Namespace, mapped: MappedRun, written: _Wri
 
 def _outcome(mapped: MappedRun, scores: TrainingFit | None) -> str:
     """Return what was found, where, and how good the map is on views that it was trained on."""
-    graph, gaussians = mapped.run.scheduled.graph, mapped.gaussians
+    graph, gaussians, mapper = mapped.run.scheduled.graph, mapped.gaussians, mapped.mapper
     region_m = gaussians.means_m[gaussians.active]
-    parts = [] if graph is None else [f"found: {found_text(mapped.mapper.objects, graph.targets, region_m)}"]
+    parts = [] if graph is None else [f"found: {found_text(mapper.objects, graph.targets, region_m, mapper.nouns)}"]
     if scores is not None:
         in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "
         views = f"{scores.n_views} training view{'s' if scores.n_views > 1 else ''}"

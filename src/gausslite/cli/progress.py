@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import sys
-import time
 from typing import Any
 
 from tqdm import tqdm
 
+from gausslite.mission.runner import MissionTotals
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.process import printable, size_text
 
 _TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
+_WITHOUT_RATE = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+"""Its own rate counts also the reading of files: beside those of the figures it would contradict them."""
 
 
 def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
@@ -24,6 +26,7 @@ def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
         position=row if on_terminal else 0,
         mininterval=_TERMINAL_INTERVAL_S if on_terminal else _LOG_INTERVAL_S,
         dynamic_ncols=on_terminal,
+        bar_format=_WITHOUT_RATE,
         file=sys.stderr,
     )
 
@@ -34,11 +37,11 @@ def print_above_bar(line: str) -> None:
 
 
 class MappingBar:
-    """A progress bar over frames, with the figures of the map."""
+    """A progress bar over frames, with the figures of the map; the rate is that of a run's summary."""
 
     def __init__(self, total: int, label: str = "map", row: int = 0) -> None:
         self._bar = progress_bar(total, label, "frame", row)
-        self._start_s = time.monotonic()
+        self._totals = MissionTotals()
 
     def __enter__(self) -> MappingBar:
         return self
@@ -52,11 +55,11 @@ class MappingBar:
 
     def count(self, outcome: FrameOutcome) -> None:
         """Advance by one frame and show its figures."""
-        self.show(int(self._bar.n) + 1, outcome.gaussians, outcome.roi_share)
+        self._totals.add(outcome)
+        self.show(int(self._bar.n) + 1, outcome.gaussians, outcome.roi_share, self._totals.hz)
 
-    def show(self, done: int, gaussians: int, roi_share: float, uplink_bytes: int | None = None) -> None:
-        """Set the number of frames and show the figures."""
-        hz = done / max(time.monotonic() - self._start_s, 1e-9)
+    def show(self, done: int, gaussians: int, roi_share: float, hz: float, uplink_bytes: int | None = None) -> None:
+        """Set the number of frames and show the figures; hz: mapped frames per second of their processing."""
         figures = f"{gaussians / 1e3:.1f}k Gaussians, ROI {roi_share:.1%}, {hz:.1f} Hz"
         if uplink_bytes is not None:
             figures += f", sent {size_text(uplink_bytes)}"

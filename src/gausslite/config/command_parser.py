@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -31,6 +32,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{**options, "allow_abbrev": False})
+        # also of a point such as -1.5,0,2: argparse takes only single numbers for values
+        self._negative_number_matcher = re.compile(r"-\.?\d[\d.,eE+-]*$")
         self.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
         # that of the chosen sub-command, whose help has the options
         self.set_defaults(**{PARSER: self})

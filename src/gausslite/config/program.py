@@ -24,8 +24,6 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError
 
 PREFIX = "GAUSSLITE_"
 CONFIG_VARIABLE = "GAUSSLITE_CONFIG"
-_SIMD_VARIABLE = "GAUSSLITE_SIMD"
-"""Chooses the instruction set of the kernels, which read it themselves."""
 PROGRAM = "_program"
 """Name of the chosen program among parsed arguments."""
 _CONFIG_HELP = (
@@ -310,11 +308,6 @@ def _convert_text(declared: OptionField, text: str) -> Any:
 def variable_name(key: str) -> str:
     """Return the environment variable of an option: GAUSSLITE_MAX_GAUSSIANS for max-gaussians."""
     return f"{PREFIX}{key.replace('-', '_').upper()}"
-
-
-def without_options(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment without option variables, for child processes that read their own configuration file."""
-    return {name: text for name, text in environment.items() if not name.startswith(PREFIX) or name == _SIMD_VARIABLE}
 
 
 def option_help(declared: OptionField, *, with_choices: bool = True) -> str:

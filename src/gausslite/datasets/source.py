@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.checks import require_whole
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
@@ -166,6 +167,7 @@ class SourceReader(Protocol):
 
 def require_position(source_name: str, i: int, count: int) -> None:
     """Raise DatasetError unless i is one of the positions 0 .. count - 1."""
+    require_whole(f"{source_name} position", i)
     if not 0 <= i < count:
         raise DatasetError(
             f"{source_name}: expected a position from 0 to {count - 1}, got {i}; indices().index({i}) is the position "
@@ -181,12 +183,6 @@ def excluded_frames_note(count: int, recorded: int, reason: str) -> str:
 def repeated_times_note(count: int, recorded: int) -> str:
     """Return the message on recorded frames with the time of an earlier one; empty if there are none."""
     return excluded_frames_note(count, recorded, "they have the time of the image before")
-
-
-def require_frames(folder: Path, count: int, expected: str) -> None:
-    """Raise DatasetError if the sequence has no frames."""
-    if count == 0:
-        raise DatasetError(f"{folder}: expected {expected}, got none")
 
 
 def require_matches(folder: Path, count: int, expected: str, times_s: Mapping[str, Sequence[float]]) -> None:

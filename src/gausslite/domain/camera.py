@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
-from gausslite.domain.checks import require_whole
+from gausslite.domain.checks import require_number, require_types, require_whole
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.pose import Twist
 
@@ -43,16 +43,12 @@ class Camera:
     height_px: int
 
     def __post_init__(self) -> None:
-        for name in ("fx_px", "fy_px"):
-            value = getattr(self, name)
-            if not 0 < value <= _MAX_FOCAL_PX:
-                raise InvalidInputError(
-                    f"camera {name}: expected a positive number up to {_MAX_FOCAL_PX:g}, got {value}"
-                )
-        for name in ("cx_px", "cy_px"):
-            value = getattr(self, name)
-            if not np.isfinite(value):
-                raise InvalidInputError(f"camera {name}: expected a finite number, got {value}")
+        for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            value, is_focal = getattr(self, name), name.startswith("f")
+            require_number(f"camera {name}", value)
+            if not (0 < value <= _MAX_FOCAL_PX if is_focal else math.isfinite(value)):
+                expected = f"a positive number up to {_MAX_FOCAL_PX:g}" if is_focal else "a finite number"
+                raise InvalidInputError(f"camera {name}: expected {expected}, got {value}")
         for name in ("width_px", "height_px"):
             value = getattr(self, name)
             require_whole(f"camera {name}", value)
@@ -219,10 +215,13 @@ class CameraMotion:
     exposure_s: float = 0.0
 
     def __post_init__(self) -> None:
+        require_types(twist=(self.twist, Twist))
         for name, velocity in (("linear_m_s", self.twist.linear_m_s), ("angular_rad_s", self.twist.angular_rad_s)):
             require_array(f"camera motion {name}", velocity, (3,), np.float64)
             if not np.isfinite(velocity).all():
                 raise InvalidInputError(f"camera motion {name}: expected finite values, got {velocity.tolist()}")
+        require_number("camera motion readout_s", self.readout_s)
+        require_number("camera motion exposure_s", self.exposure_s)
         if not (math.isfinite(self.readout_s) and abs(self.readout_s) <= MAX_READOUT_S):
             raise InvalidInputError(
                 f"camera motion readout_s: expected -{MAX_READOUT_S:g} to {MAX_READOUT_S:g}, got {self.readout_s}"

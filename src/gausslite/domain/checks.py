@@ -19,6 +19,13 @@ def require_instance(name: str, value: object, kind: type | tuple[type, ...], ex
         raise InvalidInputError(f"{name}: expected {expected}, got {describe(value)}")
 
 
+def require_types(**arguments: tuple[object, type | tuple[type, ...]]) -> None:
+    """Raise InvalidInputError unless each argument, given by its name as value and type or types, has its type."""
+    for name, (value, kind) in arguments.items():
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        require_instance(name, value, kind, " or ".join(option.__name__ for option in kinds))
+
+
 def require_whole(name: str, value: object) -> None:
     """Raise InvalidInputError unless the value is a whole number; True and False are not numbers."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):

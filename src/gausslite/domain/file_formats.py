@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +33,9 @@ FOREIGN_BYTES: Final = 512
 
 def foreign_format(start: bytes) -> str:
     """Return what a file is by its first FOREIGN_BYTES, for messages; empty for an unknown format."""
+    with suppress(zlib.error):  # before its version 4, an SPZ map is packed by gzip
+        if zlib.decompressobj(31).decompress(start, 4) == b"NGSP":
+            return "an SPZ map"
     trimmed = start.lstrip().lower()
     if start[257:262] == b"ustar":
         return "a tar archive; unpack it first"

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import require_whole
+from gausslite.domain.checks import require_types, require_whole
 from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
 
@@ -156,6 +156,7 @@ class Frame:
     def __post_init__(self) -> None:
         require_whole("frame index", self.index)
         require_whole("frame capture_time_ns", self.capture_time_ns)
+        require_types(camera=(self.camera, Camera))
         size = (self.camera.height_px, self.camera.width_px)
         require_array("frame rgb", self.rgb, (*size, 3), np.uint8)
         require_array("frame depth_m", self.depth_m, size, np.float32)
@@ -228,8 +229,3 @@ def has_whole_chunks(data: bytes) -> bool:
         if kind == b"IEND":
             break
     return offset <= len(data)
-
-
-def linear_light(encoded: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-    """Return sRGB colours in [0, 1] as linear light in [0, 1], in the same precision (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

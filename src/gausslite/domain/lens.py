@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.domain.checks import require_number, require_types
 from gausslite.domain.errors import InvalidInputError
 
 _MAX_COEFFICIENT = 1e3
@@ -37,6 +38,9 @@ class Lens:
     coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        require_types(model=(self.model, LensModel), coefficients=(self.coefficients, (tuple, list, ndarray)))
+        for value in self.coefficients:
+            require_number(f"lens {self.model}", value)
         counts = _COUNTS[self.model]
         if len(self.coefficients) not in counts:
             expected = " or ".join(map(str, counts))

@@ -103,10 +103,16 @@ class NounReport:
         """Return one line for the operator: what was found, or why nothing was."""
         if not self.match.is_searched:
             return self.match.describe()
+        return f"{self.match.describe()}: {self.outcome or self._unseen()}"
+
+    @property
+    def outcome(self) -> str:
+        """What became of the detections; empty without any."""
+        if not (self.detections or self.objects):
+            return ""
         why = f"rather {self.rival!r}" if self.rival else "which takes two moments or places"
         confirmed = f"{self.objects} confirmed" if self.objects else f"none confirmed, {why}"
-        found = f"{self.detections} detections, best score {self.best_score:.2f}, {confirmed}"
-        return f"{self.match.describe()}: {found if self.detections or self.objects else self._unseen()}"
+        return f"{self.detections} detections, best score {self.best_score:.2f}, {confirmed}"
 
     def _unseen(self) -> str:
         if self.best_frame is None:
@@ -232,12 +238,18 @@ class TeamObject:
 
 
 def found_text(
-    objects: Sequence[ObjectLandmark], targets: Sequence[str], region_means_m: Float32[ndarray, "n 3"]
+    objects: Sequence[ObjectLandmark],
+    targets: Sequence[str],
+    region_means_m: Float32[ndarray, "n 3"],
+    nouns: Sequence[NounReport] = (),
 ) -> str:
-    """Return where the targets of a task are: "mug at (2.10, 1.95, 0.78) m, no book".
+    """Return where the targets of a task are: "mug at (2.10, 1.95, 0.78) m, no book (2 detections, ...)".
 
-    region_means_m: the region's Gaussians; an object without any was seen, but is not what the task means.
+    region_means_m: the region's Gaussians; an object without any was seen, but is not what the task means. nouns: say
+    why what was detected is not reported.
     """
+    elsewhere = ", none in the task's region"
+    reasons = {n.match.noun: f" ({n.outcome}{elsewhere if n.objects else ''})" for n in nouns if n.outcome}
     meant = [
         found for found in objects if found.role is ObjectRole.TARGET and found.extent_m.contains(region_means_m).any()
     ]
@@ -246,5 +258,6 @@ def found_text(
         centres_m = [found.centroid_m for found in meant if found.noun in (noun, noun_of(noun))]
         *others, last = ["({:.2f}, {:.2f}, {:.2f})".format(*centre_m) for centre_m in centres_m] or [""]
         places = f"{', '.join(others)} and {last} m" if others else last and f"{last} m"
-        parts.append(f"{noun} at {places}" if places else f"no {noun}")
+        missing = f"no {noun}{reasons.get(noun, reasons.get(noun_of(noun), ''))}"
+        parts.append(f"{noun} at {places}" if places else missing)
     return ", ".join(parts)

@@ -20,7 +20,6 @@ _RIGIDITY_TOLERANCE = 1e-2
 _UNIT_TOLERANCE = 1e-3
 _MIN_BASELINE_S = 1e-6
 _TYPICAL_DISTANCE_M = 2.0
-_MAX_VELOCITY_CHANGE = 0.5
 _MAX_GAP_RATIO = 2.0
 
 
@@ -231,20 +230,6 @@ class Trajectory:
             return False
         gaps_s = np.diff(self.times_s[neighbours[0] : neighbours[-1] + 1])
         return bool(gaps_s.min() >= _MIN_BASELINE_S and gaps_s.max() <= _MAX_GAP_RATIO * gaps_s.min())
-
-    def is_steady(self, i: int) -> bool:
-        """True if the velocities before and after pose i are similar: only then do poses state the velocity there."""
-        if not 0 < i < len(self.times_s) - 1:
-            return False
-        before, after = (self._mean_velocity(first) for first in (i - 1, i))
-        change, mean = after - before, 0.5 * (before + after)
-        limit = _MAX_VELOCITY_CHANGE * Twist(mean[:3], mean[3:]).typical_image_speed
-        return Twist(change[:3], change[3:]).typical_image_speed <= limit
-
-    def _mean_velocity(self, i: int) -> Float64[ndarray, "6"]:
-        """Return translation and rotation per second from pose i to the next."""
-        seconds = max(float(self.times_s[i + 1] - self.times_s[i]), _MIN_BASELINE_S)
-        return twist_of(inverse(self.T_world_camera[i]) @ self.T_world_camera[i + 1]) / seconds
 
     def angular_speeds_rad_s(self) -> Float64[ndarray, " n"]:
         """Return the magnitude of the angular velocity at every pose."""

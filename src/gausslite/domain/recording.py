@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import MAX_EXPOSURE_S, MAX_READOUT_S, Camera, FileIntrinsics
+from gausslite.domain.checks import require_number, require_types
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import transform_of
@@ -91,6 +92,7 @@ class DepthRegistration:
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        require_types(intrinsics=(self.intrinsics, FileIntrinsics))
         fx, fy, cx, cy = self.intrinsics.fx, self.intrinsics.fy, self.intrinsics.cx, self.intrinsics.cy
         if not all(math.isfinite(value) for value in (fx, fy, cx, cy)) or fx <= 0 or fy <= 0:
             given = f"{fx:g},{fy:g},{cx:g},{cy:g}"
@@ -153,6 +155,7 @@ class PoseExposurePrior:
 
     def __post_init__(self) -> None:
         for name in ("translation_m", "rotation_deg", "gain", "offset"):
+            require_number(f"pose prior {name}", getattr(self, name))
             if not 0 <= getattr(self, name) <= _MAX_STD:
                 raise InvalidInputError(f"pose prior {name}: expected 0 to {_MAX_STD:g}, got {getattr(self, name)}")
 

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, back_project, project
+from gausslite.domain.checks import require_number, require_types
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
@@ -43,9 +44,12 @@ class BallRegion:
     radius_m: float
 
     def __post_init__(self) -> None:
+        require_types(centre_m=(self.centre_m, (tuple, list, ndarray)))
+        for value in (*self.centre_m, self.radius_m):
+            require_number("ball", value)
         # farther out, float32 does not resolve 0.1 m
         limit_m = _MAX_COORDINATE_M
-        if not (max(map(abs, self.centre_m)) <= limit_m and 0 < self.radius_m <= limit_m):
+        if not (len(self.centre_m) == 3 and max(map(abs, self.centre_m)) <= limit_m and 0 < self.radius_m <= limit_m):
             raise InvalidInputError(
                 f"ball: expected a centre within ±{limit_m:g} m and a radius of 0 to {limit_m:g} m, "
                 f"got {self.centre_m} and {self.radius_m}"

@@ -24,9 +24,9 @@ from gausslite.mapping.splat_table import require_memory
 from gausslite.mission.build import EstimatorFactory, build_task_mapper, open_monitor
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.prior_map import PriorMap, open_prior_map
-from gausslite.mission.recording import calibrate_with_messages, open_for_mapping, report_region_file, selected_regions
+from gausslite.mission.recording import calibrate_with_messages, open_for_mapping, selected_regions
 from gausslite.mission.results import peak_rss_mib, prepare_folder
-from gausslite.mission.runner import CorruptFrames, FrameStream, MissionResult, MissionRunner
+from gausslite.mission.runner import CorruptFrames, FrameStream, MissionResult, MissionRunner, ground_truth_notes
 from gausslite.mission.schedule import ScheduledTaskMapper, TaskSchedule
 from gausslite.mission.settings import (
     MissionSettings,
@@ -183,7 +183,8 @@ class RunPlan:
         """Report what of the tasks is not understood, and what is searched for each noun."""
         graphs = self.schedule.graphs()
         if graphs and self.perception.model is None:
-            report_region_file(self.source.spec, source)
+            for note in ground_truth_notes(self.source.spec, source):
+                print_message(note)
         for graph in graphs:
             for line in (*graph.warnings, *(match.describe() for match in models.noun_matches(graph))):
                 print_message(line)

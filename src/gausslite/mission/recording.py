@@ -30,7 +30,7 @@ from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
-from gausslite.mission.runner import region_file_note
+from gausslite.mission.runner import ground_truth_notes
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP, PoseMode, SourceSettings
 from gausslite.process import print_message
 
@@ -164,7 +164,8 @@ def selected_regions(
     if roi is not None:
         regions += choose_regions(balls_for_small_objects(load_voxel_regions(roi)), objects)
     elif objects:
-        report_region_file(spec, source)
+        for note in ground_truth_notes(spec, source):
+            print_message(note)
         regions += choose_regions(source.regions(), objects)
     return [*regions, *(_target_region(point, source) for point in target_at)]
 
@@ -179,10 +180,3 @@ def _target_region(point: TargetPoint, source: Source) -> Region:
     return pointing().region_at(
         point.point_m, (frame for _, frame in usable_frames(source, range(0, len(source), step)))
     )
-
-
-def report_region_file(spec: str, source: Source) -> None:
-    """Report that ground-truth regions come from a file of the sequence's folder, if there is one."""
-    note = region_file_note(spec, source)
-    if note is not None:
-        print_message(note)

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,9 +23,8 @@ from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.codec.state_file import write_atomic
 from gausslite.datasets.pose_track import format_pose_rows
-from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
+from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 
@@ -159,27 +157,8 @@ def write_poses(folder: Path, poses: PoseTable, T_map_sequence: Float64[ndarray,
 
 
 def read_report(folder: Path) -> Mapping[str, object]:
-    """Return the content of report.json; empty if there is none or it is not a JSON object."""
-    return _read_json(folder / _REPORT)
-
-
-def stated_up(report: Mapping[str, object]) -> UpAxis | None:
-    """Return the upward direction in the map's frame; None if the report states none. Raises InvalidInputError."""
-    stated: Any = report.get("up")
-    if stated is None:
-        return None
-    numbers = [value for value in stated if isinstance(value, int | float)] if isinstance(stated, list) else []
-    if len(numbers) != 3:
-        raise InvalidInputError(f"{_REPORT}: up: expected three numbers, got {stated!r}")
-    return unit_up_axis((numbers[0], numbers[1], numbers[2]))
-
-
-def read_evaluation(folder: Path) -> Mapping[str, object]:
-    """Return the content of evaluation.json; empty without it. Raises MapFileError for a damaged file."""
-    scores = _read_json(folder / EVALUATION)
-    if not scores and (folder / EVALUATION).exists():
-        raise MapFileError(f"{folder / EVALUATION}: expected the scores of `gausslite eval`, got something else")
-    return scores
+    """Return the content of report.json, as `read_json`."""
+    return read_json(folder / _REPORT)
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
@@ -197,7 +176,8 @@ def peak_rss_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _read_json(path: Path) -> Mapping[str, object]:
+def read_json(path: Path) -> Mapping[str, object]:
+    """Return the content of a JSON file; empty if there is none or it is not a JSON object."""
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):

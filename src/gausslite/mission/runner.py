@@ -23,11 +23,11 @@ OnCorrupt = Callable[[int, DatasetError | PoseError], None]
 _NO_FRAME_INDEX = -1
 
 
-def region_file_note(spec: str, source: Source) -> str | None:
-    """Return a message if the ground-truth regions come from a file of the sequence's folder, else None."""
-    if source.regions_file is None:
-        return None
-    return f"{spec}: the ground-truth regions of {source.regions_file.name} in the sequence's folder are used"
+def ground_truth_notes(spec: str, source: Source) -> tuple[str, ...]:
+    """Return a message if the sequence has ground-truth regions, which find objects without a detector."""
+    file = source.regions_file
+    origin = f"{file.name} in the sequence's folder" if file else "the sequence" if source.regions() else ""
+    return (f"{spec}: no detector: the ground-truth regions of {origin} are used",) if origin else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,11 @@ class MissionTotals:
     region_seen: bool = False  # a frame has shown the task's region
 
     @property
+    def hz(self) -> float:
+        """Mapped frames per second of perception and mapping, without reading files."""
+        return self.frames / self.busy_s if self.busy_s > 0 else 0.0
+
+    @property
     def skipped(self) -> int:
         """Number of frames that were not mapped."""
         return self.reasons.total()
@@ -150,11 +155,6 @@ class MissionResult:
         """Number of frames, including skipped ones."""
         return self.totals.frames + self.totals.skipped
 
-    @property
-    def hz(self) -> float:
-        """Mapped frames per second of perception and mapping, without reading files."""
-        return self.totals.frames / self.totals.busy_s if self.totals.busy_s > 0 else 0.0
-
     def raise_if_stopped(self) -> None:
         """Raise the error or interrupt that ended the mission early."""
         if self.stopped_by is not None:
@@ -171,7 +171,7 @@ class MissionResult:
             "roi_share": totals.roi_share_sum / max(totals.frames, 1),
             "keyframes_reevaluated": totals.keyframes_reevaluated,
             "seeded_in_keyframes": totals.seeded_in_keyframes,
-            "hz": self.hz,
+            "hz": totals.hz,
             "seconds": self.seconds,
             "stopped_by": None if self.stopped_by is None else str(self.stopped_by) or "interrupted",
         }

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.checks import require_types
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounReport, ObjectLandmark
@@ -269,6 +270,7 @@ class TaskMapper:
         A frame with a defect is skipped, one that the monitor refuses, one without a tracked pose, and one in which
         everything moves. When the monitor has found the robot again, the frames that waited are mapped first.
         """
+        require_types(frame=(frame, Frame))
         self._scheduler.begin(waited_s)
         repeats = self._last_image.is_repeated_by(frame)
         if defect := frame.defect or (REPEATED if repeats else ""):

@@ -103,21 +103,14 @@ def _raised(error: grpc.RpcError, name: str, address: str) -> GaussLiteError:
 
 def open_channel(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]] = ()) -> grpc.Channel:
     """Open a channel, encrypted with `tls`. The server of a unix socket must have a certificate for localhost."""
-    options = _options(address, tls, options)
+    options = channel_options(address, tls, options)
     if tls is None:
         return grpc.insecure_channel(address, options=options)
     return grpc.secure_channel(address, tls.client_credentials(), options=options)
 
 
-def open_async_channel(address: str, tls: Tls | None) -> grpc.aio.Channel:
-    """Open a channel for the event loop, as `open_channel` does, with the limits of both ends."""
-    options = _options(address, tls, [*connection_options(KEEPALIVE_S), ("grpc.max_reconnect_backoff_ms", 500)])
-    if tls is None:
-        return grpc.aio.insecure_channel(address, options=options)
-    return grpc.aio.secure_channel(address, tls.client_credentials(), options=options)
-
-
-def _options(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
+def channel_options(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
+    """Return the options with those that the address needs: no proxy within this network, the name of a socket."""
     is_unix = tls is not None and address.startswith(UNIX)
     name = [("grpc.ssl_target_name_override", "localhost")] if is_unix else []
     return [*options, *proxy_options(address), *name]

@@ -20,6 +20,7 @@ from gausslite.codec.subset_codec import CodecLimits
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import capped_size
 from gausslite.domain.camera import Camera
+from gausslite.domain.checks import require_types
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
@@ -87,7 +88,8 @@ class ParserClient(ServiceChannel):
         self._stub = parser_service_pb2_grpc.ParserServiceStub(self._channel)
 
     def parse(self, text: str) -> TaskGraph:
-        """Return the graph of a task. Raises TaskError, UnavailableError."""
+        """Return the graph of a task. Raises TaskError, InvalidInputError, UnavailableError."""
+        require_types(text=(text, str))
         request = parser_service_pb2.ParseTaskRequest(text=text)
         return convert_task.graph_from_message(self._call(self._stub.ParseTask, request).graph)
 
@@ -162,6 +164,7 @@ class AgentClient(ServiceChannel):
 
 def _fitting_message(frame: Frame, lossless: bool, lens: Lens | None) -> geometry_pb2.EncodedFrame:
     """Return the frame's message, of a smaller image if it exceeds what the agent accepts."""
+    require_types(frame=(frame, Frame))
     recorded, pixels = RgbdImage(frame.rgb, frame.depth_m, frame.camera), _MAX_SENT_PX
     while True:
         image = resize_rgbd(recorded, capped_size(frame.camera, pixels))
@@ -377,6 +380,7 @@ class FusionClient(ServiceChannel):
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first."""
+        require_types(noun=(noun, str))
         request = pb.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
         return tuple(map(team_object_from_message, self._call(self._stub.QueryObjects, request).objects))
 

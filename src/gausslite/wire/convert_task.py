@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from gausslite.domain.checks import require_types
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.objects import (
     MAX_OBJECT_COORDINATE_M,
@@ -119,13 +120,14 @@ class AssignedTask:
 def assigned_to_message(
     task: str | TaskGraph | None, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()
 ) -> agent_service_pb2.AssignTaskRequest:
-    """Encode the request of an AssignTask call."""
+    """Encode the request of an AssignTask call. Raises InvalidInputError."""
     request = agent_service_pb2.AssignTaskRequest(
         pointed=map(_pointed_to_message, pointed), excluded=map(point_to_message, excluded_m)
     )
     if isinstance(task, str):
         request.text = task
     elif task is not None:
+        require_types(task=(task, TaskGraph))
         request.graph.CopyFrom(graph_to_message(task))
     return request
 

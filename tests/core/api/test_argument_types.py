@@ -33,13 +33,39 @@ WRONG = {
     "dataclasses.replace(frame, capture_time_ns=1.5e9)": "frame capture_time_ns: expected a whole number, got float",
     "dataclasses.replace(frame, index=0.5)": "frame index: expected a whole number, got float 0.5",
     "gl.AgentClient(50053)": "AgentClient address: expected HOST:PORT or unix:PATH as text, got int",
+    "gl.load_ply(None)": "path: expected str or PathLike, got NoneType None",
+    "gl.save_ply(3, frame)": "path: expected str or PathLike, got int 3",
+    'gl.save_ply("x.ply", [])': "gaussians: expected Gaussians, got list",
+    'gl.render_view("map.ply", frame.camera, frame.T_world_camera)': "gaussians: expected Gaussians, got str",
+    'gl.render_view(empty, frame.camera, "here")': "T_world_camera: expected ndarray or list or tuple, got str",
+    "gl.render_view(empty, (320, 240), frame.T_world_camera)": "camera: expected Camera, got tuple",
+    "gl.region_on_image(0, [(1, 2)])": "frame: expected Frame, got int 0",
+    "gl.region_at(2.0, home)": "point_m: expected tuple or list or ndarray, got float",
+    'gl.ask(empty, "mug")': "objects: expected Iterable, got Gaussians",
+    'gl.ask(["mug"], "mug")': r"objects\[0\]: expected ObjectLandmark, got str 'mug'",
+    "gl.ask([], 5)": "question: expected str, got int 5",
+    'gl.Camera("a", 1, 1, 1, 2, 2)': "camera fx_px: expected a number, got str 'a'",
+    'gl.CameraMotion("fast")': "twist: expected Twist, got str 'fast'",
+    'gl.Lens("fisheye", (0.0,) * 4)': "model: expected LensModel, got str 'fisheye'",
+    'gl.Lens(gl.LensModel.FISHEYE, "0,0,0,0")': "coefficients: expected tuple or list or ndarray, got str",
+    'gl.BallRegion((0, 0, "z"), 1.0)': "ball: expected a number, got str 'z'",
+    "gl.BallRegion((0, 0), 1.0)": "ball: expected a centre within",
+    'gl.PoseExposurePrior("0.1")': "pose prior translation_m: expected a number, got str",
+    "gl.DepthRegistration((500, 500, 320, 240))": "intrinsics: expected FileIntrinsics, got tuple",
+    'dataclasses.replace(frame, camera="kinect")': "camera: expected Camera, got str 'kinect'",
+    "home.frame(1.5)": "position: expected a whole number, got float 1.5",
+    'gl.create_mapper(gl.SceneInfo()).process("a.png")': "frame: expected Frame, got str 'a.png'",
+    'gl.AgentClient("host:1").assign_task(5)': "task: expected TaskGraph, got int 5",
+    'gl.FusionClient("host:1").query_objects(5)': "noun: expected str, got int 5",
+    'gl.ParserClient("host:1").parse(None)': "text: expected str, got NoneType None",
 }
 PROGRAM = """
 import dataclasses, json, sys
 import gausslite as gl
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
 home = gl.open_sequence("sim:home?size=32x24")
-frame = home.frame(0, (32, 24))
+frame, empty = home.frame(0, (32, 24)), Gaussians.empty()
 messages = {}
 for call in json.load(sys.stdin):
     try:

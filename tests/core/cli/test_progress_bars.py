@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.cli.progress import progress_bar
+from gausslite.cli.progress import MappingBar, progress_bar
+from gausslite.mission.frame_scheduler import FrameTiming
+from gausslite.mission.runner import MissionTotals
+from gausslite.mission.task_mapper import FrameOutcome
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -25,3 +28,18 @@ def test_a_bar_shows_its_label_and_count_on_stderr(monkeypatch: pytest.MonkeyPat
     last = stderr.getvalue().replace("\r", "\n").strip().splitlines()[-1]
     assert last.startswith("mapping: ")
     assert "2/4" in last
+
+
+def test_the_rate_of_a_mapping_bar_is_that_of_the_summary(monkeypatch: pytest.MonkeyPatch) -> None:
+    stderr, totals = io.StringIO(), MissionTotals()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with MappingBar(2) as bar:
+        for seconds, skipped in ((0.5, None), (0.25, "too far")):
+            timing = FrameTiming(seconds, {}, frozenset(), False)
+            outcome = FrameOutcome(0, 1, 10, 0.0, timing, skipped)
+            totals.add(outcome)
+            bar.count(outcome)
+    last = stderr.getvalue().replace("\r", "\n").strip().splitlines()[-1]
+    assert f"{totals.hz:.1f} Hz" in last
+    assert totals.hz == 2.0
+    assert "frame/s" not in last

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, check_options, option, plain_options
 from gausslite.config.plain_values import to_toml
-from gausslite.config.program import Program, parse_options, without_options
+from gausslite.config.program import Program, parse_options
 from gausslite.domain.errors import InvalidInputError
 
 
@@ -224,11 +224,6 @@ def test_settings_of_the_python_api_have_the_same_bounds(values: dict[str, float
     with pytest.raises(InvalidInputError) as error:
         Budget(**values)  # type: ignore[arg-type]
     assert str(error.value) == message
-
-
-def test_a_child_process_inherits_no_option_variables() -> None:
-    environment = {"PATH": "/bin", "GAUSSLITE_OUT": "x", "GAUSSLITE_SIMD": "avx2"}
-    assert without_options(environment) == {"PATH": "/bin", "GAUSSLITE_SIMD": "avx2"}
 
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))

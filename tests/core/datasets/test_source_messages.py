@@ -87,7 +87,8 @@ def test_regions_of_the_folder_are_used_with_a_message(tmp_path: Path, capsys: p
     np.savez(folder / "roi_voxels.npz", voxel_size_m=0.02, mug_1=np.zeros((1, 3), np.int32))
     assert len(selected_regions(str(folder), open_source(str(folder)), None, ("mug_1",), ())) == 1
     [line] = capsys.readouterr().err.splitlines()
-    assert line == f"{folder}: the ground-truth regions of roi_voxels.npz in the sequence's folder are used"
+    origin = "roi_voxels.npz in the sequence's folder"
+    assert line == f"{folder}: no detector: the ground-truth regions of {origin} are used"
 
 
 def test_a_folder_without_poses_is_refused_with_the_option_that_tracks_them(

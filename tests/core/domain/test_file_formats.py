@@ -26,6 +26,7 @@ def tar() -> bytes:
         (POINTER, "a Git LFS pointer"),
         (b"\n<!DOCTYPE html>", "a web page"),
         (gzip.compress(b"x", mtime=0), "a gzip archive; unpack it first"),
+        (gzip.compress(b"NGSP\3\0\0\0", mtime=0), "an SPZ map"),
         (tar(), "a tar archive; unpack it first"),
         (b"\x89PNG\r\n\x1a\n", "a PNG image"),
         (b"", "an empty file"),

@@ -47,11 +47,3 @@ def test_a_single_pose_has_no_velocity() -> None:
     twist = Trajectory(np.zeros(1), np.eye(4)[None]).twist(0)
     assert not twist.angular_rad_s.any()
     assert not twist.linear_m_s.any()
-
-
-def test_a_velocity_is_steady_if_it_is_similar_before_and_after() -> None:
-    times_s = np.arange(5) / 10
-    poses = np.repeat(np.eye(4)[None], 5, axis=0)
-    poses[:, 0, 3] = [0.0, 0.1, 0.2, 0.3, 0.31]
-    trajectory = Trajectory(times_s, poses)
-    assert [trajectory.is_steady(i) for i in range(5)] == [False, True, True, False, False]

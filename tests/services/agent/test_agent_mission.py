@@ -60,6 +60,7 @@ class Wall(Source):
     poses_exact: bool = True
     camera: Camera = CAMERA
     broken_at: int | None = None
+    is_blind: bool = False
     read: list[int] = field(default_factory=list)
     reached: threading.Event = field(default_factory=threading.Event)
 
@@ -72,7 +73,8 @@ class Wall(Source):
         self.read.append(i)
         if len(self.read) == 2:
             self.reached.set()
-        return frame(i, CAMERA)
+        seen = frame(i, CAMERA)
+        return replace(seen, depth_m=np.zeros_like(seen.depth_m)) if self.is_blind else seen
 
     def indices(self) -> Sequence[int]:
         return range(self.count)
@@ -316,6 +318,15 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.L
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["frames"], report["frames_corrupt"], report["stopped_by"]) == (7, 1, None)
     assert "frame 3 skipped: wall/frame-3.png" in caplog.text
+
+
+def test_a_reason_that_repeats_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    options = settings(tmp_path)
+    with agent_mission(options) as (mission, worker):
+        mission.run(stream_of(Wall(is_blind=True), options))
+        assert worker.status().skipped == 8
+    assert caplog.text.count("skipped: no pixel has a depth") == 1
 
 
 def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(
