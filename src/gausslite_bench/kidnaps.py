@@ -147,7 +147,7 @@ class _Recording:
             "seen": range(count // 4, count // 4 + after),
             "mirrored": range(count // 4, count // 4 + after),
             "elsewhere": range(after),
-            "back": range(count + after - 1, count - after - 1, -1),
+            "back": range(count + after - 1, max(count - after, 0) - 1, -1),
         }
         chosen = positions[follow] if follow in positions else self._turned()
         rng = np.random.default_rng(0)
