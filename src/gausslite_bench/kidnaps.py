@@ -43,6 +43,8 @@ _T_BEGUN = transform_of(np.array([4.0, -3.0, 0.2, 0.0, 0.0, 2.0]))
 _NOISE = 2.0
 """Standard deviation of the colours of frames that are shown again, of 255."""
 _VIEWS = 12
+_NEAR_M = 1.0
+"""A robot that turns where it stands: frames of the recording are this close to it."""
 
 Frames = Sequence[Frame]
 Poses = Float64[ndarray, "4 4"]
@@ -56,7 +58,7 @@ def _standing(before: Frame, after: Frames) -> Poses:
 
 @dataclass(frozen=True, slots=True)
 class _Event:
-    """The odometry after it, and which frames follow: of the same way, of a place seen before, or of elsewhere."""
+    """The odometry after it, and which frames follow, by their name in `_Recording.after`."""
 
     follow: str
     T_odometry_world: Callable[[Frame, Frames], Poses]
@@ -66,12 +68,16 @@ class _Event:
 EVENTS = {
     "none": _Event("way", lambda _before, _after: np.eye(4)),
     "seen": _Event("seen", _standing),
+    "turned": _Event("turned", _standing),
     "unseen": _Event("elsewhere", _standing),
+    "look-alike": _Event("mirrored", _standing),
+    "ahead": _Event("back", _standing),
     "covered": _Event("seen", _standing, _COVERED_NS),
     "restart": _Event("way", lambda _before, after: inverse(after[0].T_world_camera)),
     "jump": _Event("way", lambda _before, _after: _T_BEGUN),
 }
-"""none; carried to a place that was seen before, or to another recording; covered for ten seconds and carried; odometry
+"""none; carried to a place that was seen before, to another recording, to a mirrored place, or ahead, from where the
+robot drives back to what it has seen; turned where it stands; covered for ten seconds and carried; odometry
 that begins at zero, or jumps, while the robot drives on."""
 
 
@@ -104,8 +110,11 @@ class _TimedMonitor(FrameMonitor):
         start_s = time.perf_counter()
         admission = super().admit(frame, mapper)
         self.seconds += time.perf_counter() - start_s
-        if admission.T_map_odometry is not None:
-            self.found.append((frame, admission.T_map_odometry))
+        T_map_odometry = admission.T_map_odometry
+        if admission.joined is not None:
+            T_map_odometry = admission.joined["T_corrected_odometry"]
+        if T_map_odometry is not None:
+            self.found.append((frame, T_map_odometry))
         return admission
 
     def confirm(self, frame: Frame, view: FrameView) -> bool:
@@ -114,6 +123,75 @@ class _TimedMonitor(FrameMonitor):
         is_confirmed = super().confirm(frame, view)
         self.seconds += time.perf_counter() - start_s
         return is_confirmed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recording:
+    """The frames of both places, with times that go on."""
+
+    source: Source
+    elsewhere: Source
+    settings: KidnapSettings
+
+    def __post_init__(self) -> None:
+        settings = self.settings
+        for source, first in ((self.source, settings.frames), (self.elsewhere, 0)):
+            if (needed := (first + settings.after) * settings.stride) > len(source):
+                raise InvalidInputError(
+                    f"{source.name}: expected at least {needed} frames, got {len(source)}; "
+                    "use fewer --frames, --after or a smaller --stride"
+                )
+
+    def before(self) -> Frames:
+        """Return the frames before each event."""
+        return self._frames(self.source, range(self.settings.frames), 0)
+
+    def after(self, follow: str) -> Frames:
+        """Return the frames that follow, those of a place that was seen with other noise."""
+        count, after = self.settings.frames, self.settings.after
+        if follow == "way":
+            return self._frames(self.source, range(count, count + after), count)
+        positions = {
+            "seen": range(count // 4, count // 4 + after),
+            "mirrored": range(count // 4, count // 4 + after),
+            "elsewhere": range(after),
+            "back": range(count + after - 1, max(count - after, 0) - 1, -1),
+        }
+        chosen = positions[follow] if follow in positions else self._turned()
+        rng = np.random.default_rng(0)
+        noisy = [
+            replace(frame, rgb=np.clip(frame.rgb + rng.normal(0, _NOISE, frame.rgb.shape), 0, 255).astype(np.uint8))
+            for frame in self._frames(self.elsewhere if follow == "elsewhere" else self.source, chosen, count)
+        ]
+        return list(map(_mirrored, noisy)) if follow == "mirrored" else noisy
+
+    def _turned(self) -> range:
+        """Return the frames from the one on that looks away the most, near where the robot stands before the event."""
+        poses = self.source.trajectory().T_world_camera[:: self.settings.stride]
+        last = poses[self.settings.frames - 1]
+        starts = range(len(poses) - self.settings.after + 1)
+        near = [i for i in starts if translation_m(poses[i], last) < _NEAR_M]
+        start = max(near, key=lambda i: rotation_angle_deg(poses[i], last))
+        return range(start, start + self.settings.after)
+
+    def _frames(self, source: Source, positions: range, index: int) -> Frames:
+        stride, camera = self.settings.stride, source.camera.narrower(self.settings.width)
+        size = camera.width_px, camera.height_px
+        step_ns = round(1e9 * stride * float(np.median(np.diff(self.source.trajectory().times_s))))
+        frames = (source.frame(position * stride, size) for position in positions)
+        return [replace(frame, index=i, capture_time_ns=i * step_ns) for i, frame in enumerate(frames, index)]
+
+
+def _mirrored(frame: Frame) -> Frame:
+    """Return what the camera would record if left and right of the world changed places."""
+    mirror, camera = np.diag([-1.0, 1.0, 1.0, 1.0]), frame.camera
+    return replace(
+        frame,
+        rgb=np.ascontiguousarray(frame.rgb[:, ::-1]),
+        depth_m=np.ascontiguousarray(frame.depth_m[:, ::-1]),
+        camera=replace(camera, cx_px=camera.width_px - camera.cx_px),
+        T_world_camera=mirror @ frame.T_world_camera @ mirror,
+    )
 
 
 def _is_wrong(T: Poses, T_true: Poses) -> bool:
@@ -128,8 +206,7 @@ def _after_event(
     true: the frames at their own poses; None of a place that the map does not have.
     """
     noticed = found = None
-    wrong_frames = wrong_gaussians = mapped = 0
-    gaussians = len(mission.gaussians())
+    wrong_gaussians, gaussians = 0, len(mission.gaussians())
     for i, frame in enumerate(odometry):
         outcome, correction = mission.process(frame), mission.poses.latest()
         is_noticed = outcome.localisation is not LocalisationState.TRACKED or (monitor is not None and monitor.found)
@@ -137,34 +214,28 @@ def _after_event(
         if outcome.skipped is None and correction is not None:
             T_world_camera = correction.T_map_odometry @ frame.T_world_camera
             is_wrong = true is None or _is_wrong(T_world_camera, true[i].T_world_camera)
-            mapped += len(outcome.mapped)
-            wrong_frames += len(outcome.mapped) * is_wrong
             wrong_gaussians += max(outcome.gaussians - gaussians, 0) * is_wrong
             found = i if found is None and not is_wrong else found
         gaussians = outcome.gaussians
-    return {"noticed": noticed, "found": found, "mapped": mapped, "wrong": wrong_frames, "wrong_gs": wrong_gaussians}
+    poses = mission.poses.state()
+    in_map = dict(zip(poses["frames"][:, 0].tolist(), poses["T_world_map"], strict=True))
+    mapped = [i for i, frame in enumerate(odometry) if frame.index in in_map]
+    wrong = sum(true is None or _is_wrong(in_map[odometry[i].index], true[i].T_world_camera) for i in mapped)
+    return {"noticed": noticed, "found": found, "mapped": len(mapped), "wrong": wrong, "wrong_gs": wrong_gaussians}
 
 
 class _Trials:
     """The missions of a recording; those of the same frames at their own poses are mapped once."""
 
-    def __init__(self, settings: KidnapSettings) -> None:
-        self._settings = settings
-        self._source, self._elsewhere = open_source(settings.source), open_source(settings.elsewhere)
-        for source, first in ((self._source, settings.frames), (self._elsewhere, 0)):
-            if (needed := (first + settings.after) * settings.stride) > len(source):
-                raise InvalidInputError(
-                    f"{source.name}: expected at least {needed} frames, got {len(source)}; "
-                    "use fewer --frames, --after or a smaller --stride"
-                )
-        self._before = self._frames(self._source, 0, settings.frames, 0)
-        self._prior = PoseExposurePrior() if self._source.poses_exact else REAL_CAMERA
+    def __init__(self, recording: _Recording) -> None:
+        self._recording, self._before = recording, recording.before()
+        self._prior = PoseExposurePrior() if recording.source.poses_exact else REAL_CAMERA
         self._references: dict[str, float] = {}
 
     def run(self, name: str, is_watched: bool) -> dict[str, Any]:
         """Return the figures of an event."""
         event = EVENTS[name]
-        after, is_known = self._after(event.follow), event.follow != "elsewhere"
+        after, is_known = self._recording.after(event.follow), event.follow not in ("elsewhere", "mirrored")
         monitor = _TimedMonitor() if is_watched else None
         mission = self._mission(monitor)
         outcomes = [mission.process(frame) for frame in self._before]
@@ -186,29 +257,6 @@ class _Trials:
             "watching_share": watching,
         }
 
-    def _after(self, follow: str) -> Frames:
-        """Return the frames that follow; those of a place that was seen before have other noise now."""
-        count, after = self._settings.frames, self._settings.after
-        if follow == "way":
-            return self._frames(self._source, count, after, count)
-        source, first = (self._source, count // 4) if follow == "seen" else (self._elsewhere, 0)
-        rng = np.random.default_rng(0)
-        return [
-            replace(frame, rgb=np.clip(frame.rgb + rng.normal(0, _NOISE, frame.rgb.shape), 0, 255).astype(np.uint8))
-            for frame in self._frames(source, first, after, count)
-        ]
-
-    def _frames(self, source: Source, first: int, count: int, index: int) -> Frames:
-        """Return frames with numbers from `index` on, and with times that go on."""
-        stride = self._settings.stride
-        camera = source.camera.narrower(self._settings.width)
-        size = camera.width_px, camera.height_px
-        step_ns = round(1e9 * stride * float(np.median(np.diff(self._source.trajectory().times_s))))
-        return [
-            replace(source.frame((first + i) * stride, size), index=index + i, capture_time_ns=(index + i) * step_ns)
-            for i in range(count)
-        ]
-
     def _odometry(self, event: _Event, after: Frames) -> Frames:
         T_odometry_world = event.T_odometry_world(self._before[-1], after)
         return [
@@ -221,7 +269,8 @@ class _Trials:
         ]
 
     def _mission(self, monitor: FrameMonitor | None = None) -> TaskMapper:
-        settings = MissionSettings(policy="uniform", iterations=self._settings.iterations, pose_prior=self._prior)
+        iterations = self._recording.settings.iterations
+        settings = MissionSettings(policy="uniform", iterations=iterations, pose_prior=self._prior)
         return TaskMapper(NoTaskEstimator(), build_mapper(settings), monitor=monitor)
 
     def _reference(self, follow: str, after: Frames) -> float:
@@ -245,7 +294,7 @@ def run_kidnaps(settings: KidnapSettings) -> Report:
     noticed, found: number of the first frame after the event that is not mapped as before, and that is mapped right.
     wrong: frames that are mapped at a wrong pose, wrong_gs: Gaussians that these add. psnr: of the frames before it.
     """
-    trials = _Trials(settings)
+    trials = _Trials(_Recording(open_source(settings.source), open_source(settings.elsewhere), settings))
     rows = []
     with progress_bar(2 * len(settings.events), "kidnaps", "mission") as progress:
         for name in settings.events:

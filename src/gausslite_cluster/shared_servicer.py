@@ -308,6 +308,7 @@ def sum_status(parts: Mapping[str, pb.GetSessionStatusResponse], owners: Owners)
             if owners.home(own.agent_id) == server:
                 agent = agents[own.agent_id]
                 agent.joined, agent.keyframes = own.joined, own.keyframes
+                agent.localisation = own.localisation
                 agent.targets[:] = own.targets
                 agent.alignment.CopyFrom(own.alignment)
     total.agents.extend(agents[name] for name in sorted(agents))

@@ -18,6 +18,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark
 from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.v1.geometry_pb2 import Localisation
 from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert import transform_from_message, values_of
@@ -25,7 +26,7 @@ from gausslite.wire.convert_task import object_from_message
 from gausslite_link.map_follower import FollowedMap, MapFollower
 
 _STATES = {number: name.removeprefix("AGENT_STATE_").lower() for name, number in pb.AgentState.items()}
-_LOCALISATIONS = {number: name.removeprefix("LOCALISATION_").lower() for name, number in pb.Localisation.items()}
+_LOCALISATIONS = {number: name.removeprefix("LOCALISATION_").lower() for name, number in Localisation.items()}
 _FRAMES = tuple(f"frames_{outcome}" for outcome in ("mapped", "skipped", "dropped", "rejected"))
 _FIGURES = ("agent_id", "gaussians", *_FRAMES, "hz", "roi_share")
 

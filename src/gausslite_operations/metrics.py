@@ -24,6 +24,7 @@ _OF_AGENTS: tuple[tuple[str, str, Callable[[AgentContribution], float]], ...] = 
     ("won_voxels", "voxels of the fused map that the agent won", lambda each: each.won_voxels),
     ("keyframes", "stored keyframes of the agent", lambda each: each.keyframes),
     ("last_seen_seconds", "time of the last message since the epoch", lambda each: each.traffic.last_seen_ns / 1e9),
+    ("localisation", "1 tracked, 2 doubtful, 3 lost, 0 before the agent says", lambda each: each.traffic.localisation),
 )
 _COUNTERS_OF_AGENTS: tuple[tuple[str, str, Callable[[AgentContribution], float]], ...] = (
     ("roi_bytes", "received bytes of the task's region", lambda each: each.traffic.roi_bytes),

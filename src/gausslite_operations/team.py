@@ -214,10 +214,15 @@ def run_status(options: argparse.Namespace) -> int:
     return TASK_NOT_FOUND if has_searched and values["roi_share"] == 0 else 0
 
 
+def _place(robot: Mapping[str, Any]) -> str:
+    """Return a remark on a robot whose place is not known; empty for others."""
+    place = robot["localisation"].removeprefix("LOCALISATION_").lower()
+    return f"; the robot is {place}" if place in ("doubtful", "lost") else ""
+
+
 def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:
     state = status["state"].removeprefix(_STATE_PREFIX).replace("_", " ").lower()
-    place = status["localisation"].removeprefix("LOCALISATION_").lower()
-    yield f"agent {status['agent_id']}: {state}{f'; the robot is {place}' if place in ('doubtful', 'lost') else ''}"
+    yield f"agent {status['agent_id']}: {state}{_place(status)}"
     if "graph" in status:
         yield f"task       {status['graph']['text']}"
     yield (
@@ -268,7 +273,8 @@ def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
     yield f"fused map  {_count(status['fused_gaussians'])} Gaussians in {_count(status['fused_voxels'])} voxels"
     yield f"keyframes  {status['keyframes']}; {'refined' if status['refined'] else 'not refined yet'}"
     for agent in status["agents"]:
-        state = f"{'joined' if agent['joined'] else 'absent'}, {_last_contact(int(agent['last_seen_ns']))}"
+        state = "joined" if agent["joined"] else "absent"
+        state += f", {_last_contact(int(agent['last_seen_ns']))}{_place(agent)}"
         yield (
             f"{agent['agent_id']:10} {state}; {_count(agent['gaussians'])} Gaussians, "
             f"wins {_count(agent['won_voxels'])} of {_count(agent['voxels'])} voxels, {agent['keyframes']} keyframes; "

@@ -61,7 +61,7 @@ class LoopCloser(PoseCorrector):
         """Prior: of the error of single poses. Raises MissingPluginError if GTSAM is not installed."""
         require_graph_solver()
         self._rasterizer = rasterizer
-        self._graph = PoseGraph(prior)
+        self._prior, self._graph = prior, PoseGraph(prior)
         self._noise = (
             max(_NOISE[0], _NOISE_STDS * prior.translation_m),
             max(_NOISE[1], _NOISE_STDS * prior.rotation_deg),
@@ -106,6 +106,19 @@ class LoopCloser(PoseCorrector):
         if loop is not None:
             self._graph.add_loop(loop)
         return None if is_noise else self._solve(loop)
+
+    def begin_another(self) -> LoopCloser:
+        """Return one without keyframes; see `PoseCorrector.begin_another`."""
+        return LoopCloser(self._rasterizer, self._prior)
+
+    def joined(self, piece: State, T_map_piece: Float64[ndarray, "4 4"]) -> State:
+        """Return the state with the keyframes of a piece; see `PoseCorrector.joined`."""
+        state = self.state()
+        return {
+            "counts": state["counts"] + piece["counts"],
+            **{name: np.concatenate([state[name], piece[name]]) for name in ("descriptors", "times_ns")},
+            **add_prefix("graph", self._graph.joined(select_prefix(piece, "graph"), T_map_piece)),
+        }
 
     def state(self) -> State:
         """Return the pose graph and the counts."""

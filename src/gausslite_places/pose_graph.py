@@ -236,6 +236,23 @@ class PoseGraph:
             "accepted": self._accepted,
         }
 
+    def joined(self, piece: State, T_map_piece: Float64[ndarray, "4 4"]) -> State:
+        """Return the state with the keyframes of another graph after these, moved by one motion.
+
+        Between the two, the motion that joins them counts as if the robot had driven it.
+        """
+        state, moved = self.state(), T_map_piece @ piece["T_world_keyframe"]
+        between = inverse(self._T_world_keyframe[-1]) @ moved[0]
+        joined = {name: np.concatenate([state[name], piece[name]]) for name in ("T_earlier_later", "accepted")}
+        for name in ("odometry_steps", "map_steps", "image_steps"):
+            joined[name] = np.concatenate([state[name], between[None], piece[name]])
+        return {
+            **joined,
+            "T_world_keyframe": np.concatenate([state["T_world_keyframe"], moved]),
+            "T_world_prior": T_map_piece @ piece["T_world_prior"],
+            "loops": np.concatenate([state["loops"], piece["loops"] + len(self)]),
+        }
+
     def restore(self, state: State) -> None:
         """Continue from another graph's state. Raises MapFileError, PoseError."""
         poses = _rigid(state, "T_world_keyframe", None)

@@ -39,24 +39,34 @@ class Agreement(Enum):
     UNKNOWN = "unknown"
 
 
-def compare(frame: Frame, rendered: RenderedView | None, earlier: Sequence[Frame]) -> Agreement:
-    """Compare a frame with the map rendered from its pose and with earlier frames; unknown without a rendering."""
+def compare(
+    frame: Frame, rendered: RenderedView | None, earlier: Sequence[Frame], only_contradiction: bool = False
+) -> Agreement:
+    """Compare a frame with the map rendered from its pose and with earlier frames; unknown without a rendering.
+
+    only_contradiction: agreement is not asked for; it may be unknown, in a third of the time.
+    """
     if rendered is None:
         return Agreement.UNKNOWN
-    small = reduced(frame, _WIDTH_PX)
-    size = small.camera.width_px, small.camera.height_px
-    alpha, map_m = (_reduced_image(image, small.camera) for image in (rendered.alpha, rendered.depth_m))
-    measured = small.depth_m > 0
+    camera = frame.camera.narrower(_WIDTH_PX)
+    depth_m, alpha, map_m = (
+        _reduced_image(image, camera) for image in (frame.depth_m, rendered.alpha, rendered.depth_m)
+    )
+    measured = depth_m > 0
     covered = measured & (alpha > _OPAQUE_ALPHA)
     measured_px, covered_px = int(np.count_nonzero(measured)), int(np.count_nonzero(covered))
     if covered_px < _MIN_COVERED * measured_px or covered_px == 0:
         return Agreement.UNKNOWN
-    depth = np.count_nonzero(covered & (np.abs(map_m - small.depth_m) < _DEPTH_SHARE * small.depth_m)) / covered_px
+    depth = np.count_nonzero(covered & (np.abs(map_m - depth_m) < _DEPTH_SHARE * depth_m)) / covered_px
+    if only_contradiction and depth >= _MIN_DEPTH:
+        return Agreement.UNKNOWN
+    small = reduced(frame, _WIDTH_PX)
+    size = small.camera.width_px, small.camera.height_px
     rgb = np.float32(255.0) * np.clip(cv2.resize(rendered.rgb, size, interpolation=cv2.INTER_AREA), 0.0, 1.0)
     texture = texture_correlation(blurred_luminance(rgb), blurred_luminance(small.rgb), covered)
     if depth >= _MIN_DEPTH or texture >= _MAX_TEXTURE:
         return Agreement.AGREES if depth >= _MIN_DEPTH and texture >= _MIN_TEXTURE else Agreement.UNKNOWN
-    seen_through = covered & (small.depth_m > (1.0 + _DEPTH_SHARE) * map_m + _THROUGH_M)
+    seen_through = covered & (depth_m > (1.0 + _DEPTH_SHARE) * map_m + _THROUGH_M)
     contradicted = np.count_nonzero(seen_through) / measured_px + _in_free_space(small, earlier)
     return Agreement.CONTRADICTS if contradicted >= _MIN_CONTRADICTED else Agreement.UNKNOWN
 

@@ -2,6 +2,7 @@
 
 Every start is one case: an odometry or agent that begins again, a clock that jumps, a robot that is lifted. The first
 frame that contradicts makes the place doubtful, further ones make the robot lost; agreement or a found place ends both.
+What a lost robot sees of a place that stays unknown is mapped apart, and joined when the place is found.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from gausslite_calibration.live_check import LiveCheck
 from gausslite_places.verification import verify
 from gausslite_relocalisation.agreement import Agreement, compare, is_another_place
 from gausslite_relocalisation.motion import Doubt, OdometrySteps
+from gausslite_relocalisation.piece import Piece
 from gausslite_relocalisation.place_search import PlaceSearch
 
 _EARLIER = 3
@@ -49,7 +51,7 @@ class FrameMonitor(LocalisationMonitor):
 
         in_background: whether live frames are compared with each other there; None: they were compared before.
         """
-        self._prior = prior
+        self._prior, self._in_background = prior, in_background
         self._check = None if in_background is None else LiveCheck(in_background)
         self._refusal = ""
         self._localisation = LocalisationState.TRACKED
@@ -57,13 +59,15 @@ class FrameMonitor(LocalisationMonitor):
         self._waiting: deque[Frame] = deque(maxlen=_MAX_WAITING)
         self._recovered: set[FrameId] = set()
         self._search: PlaceSearch | None = None
+        self._piece: Piece | None = None
+        self._saved_piece: State = {}
         self._earlier: list[Frame] = []
         self._newest: Frame | None = None
         self._cause, self._is_continued = "", False
         # of the present doubt: its first frame; frames so far; the latest ones in a row that agree, or leave it open
         self._since = self._doubtful = self._agreed = self._open = 0
-        # of the mission: frames that agreed, doubts, places that were found
-        self._known = self._doubts = self._found = 0
+        # of the mission: frames that agreed, doubts, places that were found, pieces of map that were joined, or left
+        self._known = self._doubts = self._found = self._joined = self._left = 0
 
     @property
     def localisation(self) -> LocalisationState:
@@ -73,19 +77,30 @@ class FrameMonitor(LocalisationMonitor):
     @property
     def notes(self) -> tuple[str, ...]:
         """One line while the robot's place is not known; one line of what happened before."""
-        now, before = "", ""
+        now, before, frames = "", "", "its frames are not mapped"
+        if self._piece is not None:
+            frames = f"{len(self._piece)} frames are mapped apart, and left out of the map until its place is found"
         if self._localisation is not LocalisationState.TRACKED:
             name = self._localisation.name.lower()
-            now = f"the robot's place is {name} since frame {self._since}: {self._cause}; its frames are not mapped"
+            now = f"the robot's place is {name} since frame {self._since}: {self._cause}; {frames}"
         elif self._doubts:
             before = f"the robot's place was doubtful {self._doubts} times, and {self._found} times found in the map"
-        return (*(() if self._check is None else self._check.notes), *filter(None, (now, before)))
+        pieces = ""
+        if self._joined or self._left:
+            pieces = f"pieces that were mapped apart: {self._joined} joined to the map, {self._left} left out"
+        return (*(() if self._check is None else self._check.notes), *filter(None, (now, before, pieces)))
 
     def admit(self, frame: Frame, mapper: GaussianMapper) -> Admission:
         """Return which frames are to be mapped now; see `LocalisationMonitor.admit`."""
         self._newest = frame
         self._earlier = [view.keyframe.frame for view in mapper.store.window[-_EARLIER:]]
         doubt = self._steps.add(frame)
+        if self._saved_piece:
+            self._piece = self._open_piece(mapper)
+            self._piece.restore(self._saved_piece)
+            self._saved_piece = {}
+        if self._piece is not None:
+            return self._admit_apart(self._piece, frame, mapper)
         if doubt is not None and self._known >= _KNOWN_AFTER:
             self._begin_doubt(frame, doubt)
             self._begin_odometry()
@@ -105,7 +120,8 @@ class FrameMonitor(LocalisationMonitor):
         """Return False if a frame contradicts the map; see `LocalisationMonitor.confirm`."""
         is_recovered = frame.id in self._recovered
         self._recovered.discard(frame.id)
-        agreement = compare(frame, view.rendered, self._earlier)
+        is_known = self._known >= _KNOWN_AFTER
+        agreement = compare(frame, view.rendered, self._earlier, only_contradiction=is_known)
         self._known += agreement is Agreement.AGREES
         if agreement is not Agreement.CONTRADICTS or self._known < _KNOWN_AFTER:
             return True
@@ -117,17 +133,22 @@ class FrameMonitor(LocalisationMonitor):
         return False
 
     def state(self) -> State:
-        """Return the state, the counts and the odometry's steps; frames that wait are not saved."""
-        counts = self._localisation, self._since, self._doubtful, self._known, self._doubts, self._found
-        return {"counts": int_array(*counts), **add_prefix("steps", self._steps.state())}
+        """Return the state, the counts, the odometry's steps and the piece; frames that wait are not saved."""
+        counts = self._known, self._doubts, self._found, self._joined, self._left
+        return {
+            "counts": int_array(self._localisation, self._since, self._doubtful, *counts),
+            **add_prefix("steps", self._steps.state()),
+            **add_prefix("piece", self._saved_piece if self._piece is None else self._piece.state()),
+        }
 
     def restore(self, state: State) -> None:
         """Continue from another monitor's state. Raises MapFileError, PoseError."""
-        localisation, self._since, self._doubtful, *counts = get_counts(state, "counts", 6)
-        self._known, self._doubts, self._found = counts
+        localisation, self._since, self._doubtful, *counts = get_counts(state, "counts", 8)
+        self._known, self._doubts, self._found, self._joined, self._left = counts
         self._localisation = LocalisationState(min(localisation, LocalisationState.LOST))
         self._cause = "it was so when the mission was saved"
         self._steps.restore(select_prefix(state, "steps"))
+        self._saved_piece = {name: array.copy() for name, array in select_prefix(state, "piece").items()}
 
     def _admit_doubtful(self, frame: Frame, mapper: GaussianMapper) -> Admission:
         agreement = self._compare(frame, mapper)
@@ -150,7 +171,38 @@ class FrameMonitor(LocalisationMonitor):
             T_map_odometry = self._search.offer(frame)
             if T_map_odometry is not None:
                 return self._end_doubt(frame, T_map_odometry)
+            if self._search.is_unknown and Piece.fits(mapper):
+                return self._begin_piece(frame, mapper)
         self._waiting.append(frame)
+        return Admission()
+
+    def _begin_piece(self, frame: Frame, mapper: GaussianMapper) -> Admission:
+        """Begin a piece of map with the frames that wait, and this one."""
+        self._piece = piece = self._open_piece(mapper)
+        for waited in (*self._waiting, frame):
+            if not piece.is_lost:
+                piece.add(waited)
+        self._waiting.clear()
+        return Admission()
+
+    def _open_piece(self, mapper: GaussianMapper) -> Piece:
+        return Piece(mapper, FrameMonitor(in_background=self._in_background))
+
+    def _admit_apart(self, piece: Piece, frame: Frame, mapper: GaussianMapper) -> Admission:
+        """Map a frame in the piece; join the piece as soon as the map shows its place."""
+        self._search = self._search or PlaceSearch(mapper, self._prior)
+        mapped = piece.add(frame)
+        T_map_piece = None if mapped is None else self._search.offer(mapped)
+        if T_map_piece is not None:
+            joined = piece.joined(mapper, T_map_piece)
+            self._piece, self._joined, self._found = None, self._joined + 1, self._found + 1
+            # once more, now with the task
+            return replace(self._end_doubt(frame), joined=joined)
+        if piece.is_lost:
+            self._piece, self._left = None, self._left + 1
+            self._begin_odometry()
+            self._steps.begin(is_followed=False)
+            self._waiting.append(frame)
         return Admission()
 
     def _compare(self, frame: Frame, mapper: GaussianMapper) -> Agreement:

@@ -13,6 +13,7 @@ from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg, tr
 from gausslite.domain.state import State, get_array, get_counts, get_floats, int_array
 from gausslite_calibration.consistency import match_pair
 from gausslite_calibration.live_check import FrameWindow, compared
+from gausslite_relocalisation.image_motion import refined_by_images
 
 _STEP_M, _SPEED_M_S = 0.5, 3.0
 _STEP_DEG, _SPEED_DEG_S = 60.0, 180.0
@@ -121,11 +122,11 @@ class OdometrySteps:
             return Doubt(f"the odometry jumped by {_text(step)}") if is_too_far else None
         if last is None or not pair.contradicts(inverse(frame.T_world_camera) @ last.T_world_camera):
             return None
-        shown = pair.matched.T_current_reference
+        T_last_frame = refined_by_images(last, frame, inverse(pair.matched.T_current_reference))
         if self.T_before_now is not None:
-            T_last_now = last.T_world_camera @ inverse(shown) @ inverse(frame.T_world_camera)
+            T_last_now = last.T_world_camera @ T_last_frame @ inverse(frame.T_world_camera)
             self.T_before_now = self.T_before_now @ T_last_now
-        shown_m = float(np.linalg.norm(shown[:3, 3]))
+        shown_m = float(np.linalg.norm(T_last_frame[:3, 3]))
         cause = f"the odometry jumped by {_text(step)}, and the images show {shown_m:.2f} m"
         return Doubt(cause, self._is_back(frame))
 

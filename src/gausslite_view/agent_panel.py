@@ -106,13 +106,17 @@ class AgentPanel:
             self._end.disabled = False
 
 
+def place_text(robot: Any) -> str:
+    """Return a remark on a robot whose place is not known, by the message about it; empty for others."""
+    places = robot.DESCRIPTOR.fields_by_name["localisation"].enum_type.values_by_number
+    place = places[robot.localisation].name.removeprefix("LOCALISATION_").lower()
+    return f"; the robot is {place}" if place in ("doubtful", "lost") else ""
+
+
 def _status_lines(status: Any) -> Iterator[str]:
     descriptor = status.DESCRIPTOR.fields_by_name["state"].enum_type.values_by_number
     state = descriptor[status.state].name.removeprefix(_STATE_PREFIX) if status.state in descriptor else "UNKNOWN"
-    places = status.DESCRIPTOR.fields_by_name["localisation"].enum_type.values_by_number
-    place = places[status.localisation].name.removeprefix("LOCALISATION_").lower()
-    shown = f"; the robot is {place}" if place in ("doubtful", "lost") else ""
-    yield f"{status.agent_id}: {state.replace('_', ' ').lower()}{shown}"
+    yield f"{status.agent_id}: {state.replace('_', ' ').lower()}{place_text(status)}"
     if status.graph.text:
         yield f"task: {status.graph.text}"
     yield (

@@ -13,6 +13,7 @@ from gausslite.wire.clients import Export, FusionClient
 from gausslite_evaluation.compare import map_purpose
 from gausslite_link.map_follower import MapFollower
 from gausslite_objects.object_memory import ObjectMemory
+from gausslite_view.agent_panel import place_text
 from gausslite_view.cameras import TeamCameras, TeamKeyframes
 from gausslite_view.contents import ViewContents, followed_contents
 from gausslite_view.map_page import MapPage, text_html
@@ -120,6 +121,7 @@ class FusionPanel:
                 f"{agent.voxels:,} voxels, alone lacks {max(status.fused_voxels - agent.voxels, 0):,}; "
                 f"{size_text(agent.roi_bytes + agent.handover_bytes)} received"
                 f"{'; ' if agent.alignment.message else ''}{agent.alignment.message}"
+                f"{place_text(agent)}"
                 for agent in status.agents
             ),
         ]

@@ -64,6 +64,7 @@ _LINES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("Gaussians after each frame", "gaussians", as_count),
     ("region's share of the pixels", "roi_share", as_percent),
     ("training iterations of each frame", "iterations", as_count),
+    ("place of the robot: 0 tracked, 1 doubtful, 2 lost", "localisation", as_count),
 )
 
 

@@ -47,6 +47,7 @@ from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
+from gausslite.v1.geometry_pb2 import LOCALISATION_LOST
 from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartRequest
 from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
 from gausslite.wire.channel import open_channel
@@ -220,7 +221,8 @@ def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[Sha
     subsets = [scattered("ant", seq, seq) for seq in (1, 2)]
     list(two.contribute([request(session, subset) for subset in subsets], 20.0))
     pytest.raises(NameInUseError, three.join, "ant", GRID)
-    assert [client.keep_session(session).highest_update_seq for client in (one, two, three)] == [2, 2, 2]
+    assert [client.keep_session(session, "lost").highest_update_seq for client in (one, two, three)] == [2, 2, 2]
+    assert [client.status().agents[0].localisation for client in (one, two, three)] == [LOCALISATION_LOST] * 3
     digests = [client.stored_digests(session) for client in (one, two, three)]
     latest = np.concatenate([np.full(len(own.batch), own.update_seq, np.int64) for own in subsets])
     keys = np.concatenate([own.batch.keys for own in subsets])

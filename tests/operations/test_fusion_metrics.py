@@ -30,7 +30,7 @@ def engine() -> FusionEngine:
     for agent_id, kappa in (("ant", 1), ("bee", 2)):
         session = engine.join(agent_id, ANYTHING).session.session_id
         engine.contribute(session, make_subset(agent_id, 1, {0: [kappa], 1: [3 - kappa], 2: [kappa]}), GRID)
-    engine.traffic.record("bee", TrafficCounters(roi_bytes=5000, subsets_rejected=7))
+    engine.traffic.record("bee", TrafficCounters(roi_bytes=5000, subsets_rejected=7, localisation=3))
     return engine
 
 
@@ -51,6 +51,7 @@ def test_prometheus_reads_the_mission_and_each_agent(engine: FusionEngine) -> No
         assert values["gausslite_agent_won_voxels", "ant"] == 1
         assert values["gausslite_agent_won_voxels", "bee"] == 2
         assert values["gausslite_agent_joined", "ant"] == 1
+        assert values["gausslite_agent_localisation", "bee"] == 3
         assert values["gausslite_agent_roi_bytes_total", "bee"] == 5000
         assert values["gausslite_agent_subsets_rejected_total", "bee"] == 7
         assert values["gausslite_fusion_acknowledgement_seconds_count", ""] == 2

@@ -112,3 +112,24 @@ def test_a_loop_with_an_unknown_keyframe_is_refused() -> None:
     graph = drifting_graph(circle())
     graph.add_loop(Loop(0, COUNT, np.eye(4)))
     pytest.raises(MapFileError, PoseGraph(PoseExposurePrior()).restore, graph.state()).match("loops")
+
+
+def test_a_piece_that_is_joined_keeps_its_steps_and_loops_and_is_corrected_with_the_map() -> None:
+    true = circle()
+    whole, T_map_piece = drifting_graph(true[:20]), transform_of(np.array([1.0, -2.0, 0.0, 0.0, 0.0, 0.5]))
+    piece = PoseGraph(PoseExposurePrior())
+    for T in true[20:]:
+        T_piece_keyframe = inverse(T_map_piece) @ T
+        piece.add(T_piece_keyframe, T_piece_keyframe)
+    piece.add_loop(true_loop(true[20:], 2, 18))
+    wrong = transform_of(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.03]))
+    whole.restore(whole.joined(piece.state(), wrong @ T_map_piece))
+    np.testing.assert_allclose(whole.poses[20:], wrong @ np.array(true[20:]), atol=1e-9)
+    [loop] = whole.loops
+    assert (loop.earlier, loop.later, whole.residual(loop)[0] < 1e-9) == (22, 38, True)
+    before = error_m(whole, true)
+    for later in range(20, 40, 4):
+        whole.add_loop(true_loop(true, later - 20, later))
+    whole.apply(whole.solve())
+    assert whole.accepted.all()
+    assert error_m(whole, true) < 0.6 * before

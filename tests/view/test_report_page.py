@@ -78,6 +78,8 @@ def test_runs_are_side_by_side_at_the_same_views(tmp_path):
     first = write_run(tmp_path / "first", task=TASK, hz=2.5)
     second = write_run(tmp_path / "second", hz=4.0, peak_rss_mib=300.0)
     (second / "evaluation.json").write_text(json.dumps({"roi_psnr": 25.5, "full_psnr": 21.25, "n_views": 7}))
+    frames = second / "frames.csv"
+    frames.write_text(frames.read_text().replace("0.2,0\n", "0.2,2\n"))
     page = report(first, second, out=tmp_path / "both.html")
     rows = table_rows(tmp_path / "both.html")
     assert rows["frame rate"] == ["2.50 Hz", "4.00 Hz"]
@@ -93,6 +95,7 @@ def test_runs_are_side_by_side_at_the_same_views(tmp_path):
     assert page.tags.count("polyline") > 4
     # one plot has the size of the final maps, one their growth
     assert page.texts.count("Gaussians after each frame") == 1
+    assert page.texts.count("place of the robot: 0 tracked, 1 doubtful, 2 lost") == 1
 
 
 def test_a_damaged_evaluation_is_one_line_and_leaves_out_the_scores(tmp_path, capsys):

@@ -334,12 +334,14 @@ class MappingWorker:
         assert self._task_mapper is not None
         frame = self._place(queued.frame)
         if frame is None:
-            self._status.update(localisation=LocalisationState.LOST)
+            self._set_localisation(LocalisationState.LOST)
             self._update_notes((LOCALISING,))
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index = frame.index
-        self._status.update(localisation=self._task_mapper.localisation)
+        self._set_localisation(self._task_mapper.localisation)
+        for record in self.records:
+            record.add(outcome, self._mapper.poses, self._mapper.gaussians)
         self._update_notes(self._task_mapper.notes)
         self._update_objects(self._task_mapper.objects)
         if outcome.skipped is not None:
@@ -357,12 +359,15 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.enqueue_newest(self._mapper.store.kept)
-        for record in self.records:
-            record.add(outcome, self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
         self._count(report, outcome)
         self._on_change()
         return report
+
+    def _set_localisation(self, localisation: LocalisationState) -> None:
+        self._status.update(localisation=localisation)
+        if self.uplink is not None:
+            self.uplink.report_localisation(localisation.name.lower())
 
     def _place(self, frame: Frame) -> Frame | None:
         """Return the frame in the map's frame; None while the agent localises itself in an earlier map.

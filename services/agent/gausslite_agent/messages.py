@@ -6,6 +6,7 @@ import time
 
 from gausslite.mission.localisation_monitor import LocalisationState
 from gausslite.v1 import agent_service_pb2 as pb
+from gausslite.v1.geometry_pb2 import Localisation
 from gausslite.wire.convert import enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
 from gausslite.wire.update_sender import UplinkCounters
@@ -14,7 +15,7 @@ from gausslite_agent.state import FrameReport, MissionState, MissionSummary, Out
 
 _STATES = enum_numbers(pb.AgentState, MissionState)
 _OUTCOMES = enum_numbers(pb.FrameOutcome, Outcome)
-_LOCALISATIONS = enum_numbers(pb.Localisation, LocalisationState)
+_LOCALISATIONS = enum_numbers(Localisation, LocalisationState)
 
 
 def frame_report_to_message(report: FrameReport) -> pb.IngestFramesResponse:

@@ -52,10 +52,10 @@ def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> Session
     return session
 
 
-def kept_session(engine: FusionEngine, session_id: str, caller: Caller) -> pb.KeepSessionResponse:
+def kept_session(engine: FusionEngine, request: pb.KeepSessionRequest, caller: Caller) -> pb.KeepSessionResponse:
     """Renew the lease of a session; return what identifies the stored updates. Raises as `session_of`."""
-    agent_id = session_of(engine, session_id, caller).agent_id
-    engine.traffic.record(agent_id, TrafficCounters())
+    agent_id = session_of(engine, request.session_id, caller).agent_id
+    engine.traffic.record(agent_id, TrafficCounters(localisation=request.localisation))
     return pb.KeepSessionResponse(
         highest_update_seq=engine.store.totals(agent_id).highest_update_seq,
         incarnation_id=engine.store.incarnation_id,

@@ -251,7 +251,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
         """Renew the agent's lease; return what identifies the stored updates."""
-        return await self._work(context, messages.kept_session, self.engine, request.session_id, Caller.of(context))
+        return await self._work(context, messages.kept_session, self.engine, request, Caller.of(context))
 
     async def GetUpdateDigests(
         self, request: pb.GetUpdateDigestsRequest, context: Any

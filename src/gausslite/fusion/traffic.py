@@ -109,6 +109,7 @@ class TrafficCounters:
     """Messages of one agent."""
 
     last_seen_ns: int = 0  # time of its latest subset or sign of life, 0 before
+    localisation: int = 0  # of the robot, as its agent said last: a number of the protocol, 0 before
     roi_bytes: int = 0  # of the region's voxels, while the mission runs
     handover_bytes: int = 0  # of the rest of the map, after it
     subsets_accepted: int = 0
@@ -116,9 +117,10 @@ class TrafficCounters:
     subsets_rejected: int = 0
 
     def plus(self, newer: TrafficCounters) -> TrafficCounters:
-        """Return the sums, with last_seen_ns of the newer counters."""
-        counts = zip(astuple(self)[1:], astuple(newer)[1:], strict=True)
-        return TrafficCounters(newer.last_seen_ns, *(own + more for own, more in counts))
+        """Return the sums, with last_seen_ns of the newer counters, and its localisation if it states one."""
+        counts = zip(astuple(self)[2:], astuple(newer)[2:], strict=True)
+        localisation = newer.localisation or self.localisation
+        return TrafficCounters(newer.last_seen_ns, localisation, *(own + more for own, more in counts))
 
 
 class TrafficLog:

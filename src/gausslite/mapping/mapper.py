@@ -123,6 +123,12 @@ class GaussianMapper:
         self.table.append(earlier)
         self._has_prior = True
 
+    def begin_another(self) -> GaussianMapper:
+        """Return an empty map with the same settings, for as many Gaussians as still fit into this one."""
+        settings = replace(self.settings, max_gaussians=max(self.table.free_slots, 1))
+        corrector = None if self.corrector is None else self.corrector.begin_another()
+        return GaussianMapper(settings, self._rasterizer, corrector=corrector)
+
     def look(self, frame: Frame, scheduler: StageScheduler) -> FrameView:
         """Return the frame with the map rendered from its pose, unless the scheduler skips seeding."""
         if self.table.count == 0 or scheduler.skips(SkippableStage.SEEDING):

@@ -58,6 +58,12 @@ class PoseCorrector(Protocol):
         without any, no loop is searched. table: the map, which is only read.
         """
 
+    def begin_another(self) -> PoseCorrector:
+        """Return a corrector without keyframes, of the same settings."""
+
+    def joined(self, piece: State, T_map_piece: Float64[ndarray, "4 4"]) -> State:
+        """Return this one's state with the keyframes of another one after its own, which move by one motion."""
+
     def state(self) -> State:
         """Return everything that the next keyframe depends on."""
 

@@ -278,6 +278,8 @@ class TaskMapper:
         admitted = Admission((frame,)) if self._monitor is None else self._monitor.admit(frame, self._mapper)
         if not admitted.frames:
             return self._skip(frame, admitted.reason)
+        if admitted.joined is not None:
+            self._mapper.restore(admitted.joined)
         if admitted.T_map_odometry is not None:
             self._mapper.poses.T_corrected_odometry = admitted.T_map_odometry
         recovered = []

@@ -87,30 +87,6 @@ AGENT_STATE_FAILED: AgentState.ValueType  # 6
 """An error ended the mission; `notes` has it."""
 Global___AgentState: _TypeAlias = AgentState  # noqa: Y015
 
-class _Localisation:
-    ValueType = _typing.NewType("ValueType", _builtins.int)
-    V: _TypeAlias = ValueType  # noqa: Y015
-
-class _LocalisationEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Localisation.ValueType], _builtins.type):
-    DESCRIPTOR: _descriptor.EnumDescriptor
-    LOCALISATION_UNSPECIFIED: _Localisation.ValueType  # 0
-    LOCALISATION_TRACKED: _Localisation.ValueType  # 1
-    LOCALISATION_DOUBTFUL: _Localisation.ValueType  # 2
-    """The latest frame contradicts the map, or the odometry or its clock has jumped."""
-    LOCALISATION_LOST: _Localisation.ValueType  # 3
-    """The agent searches the robot's place in its map. When it is found, `map_to_odom` changes once."""
-
-class Localisation(_Localisation, metaclass=_LocalisationEnumTypeWrapper):
-    """Whether the robot's place in the map is known. Frames of a robot that is not tracked wait, and the map does not change."""
-
-LOCALISATION_UNSPECIFIED: Localisation.ValueType  # 0
-LOCALISATION_TRACKED: Localisation.ValueType  # 1
-LOCALISATION_DOUBTFUL: Localisation.ValueType  # 2
-"""The latest frame contradicts the map, or the odometry or its clock has jumped."""
-LOCALISATION_LOST: Localisation.ValueType  # 3
-"""The agent searches the robot's place in its map. When it is found, `map_to_odom` changes once."""
-Global___Localisation: _TypeAlias = Localisation  # noqa: Y015
-
 @_typing.final
 class AssignTaskRequest(_message.Message):
     """With points alone, the current task stays; the objects are added to it or removed from it."""
@@ -400,7 +376,7 @@ class GetAgentStatusResponse(_message.Message):
     age_p50_seconds: _builtins.float
     """50th and 99th percentile of the latest frames' age_seconds; 0 before the first."""
     age_p99_seconds: _builtins.float
-    localisation: Global___Localisation.ValueType
+    localisation: _geometry_pb2.Localisation.ValueType
     @_builtins.property
     def graph(self) -> _task_pb2.TaskGraph: ...
     @_builtins.property
@@ -437,7 +413,7 @@ class GetAgentStatusResponse(_message.Message):
         age_p99_seconds: _builtins.float = ...,
         map_to_odom: Global___MapToOdometry | None = ...,
         objects: _abc.Iterable[_objects_pb2.ObjectLandmark] | None = ...,
-        localisation: Global___Localisation.ValueType = ...,
+        localisation: _geometry_pb2.Localisation.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "map_to_odom", b"map_to_odom", "uplink", b"uplink"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...

@@ -272,15 +272,19 @@ class KeepSessionRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     SESSION_ID_FIELD_NUMBER: _builtins.int
+    LOCALISATION_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
+    localisation: _geometry_pb2.Localisation.ValueType
+    """Of the robot; sent at once when it changes."""
     def __init__(
         self,
         *,
         session_id: _builtins.str = ...,
+        localisation: _geometry_pb2.Localisation.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["localisation", b"localisation", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -891,6 +895,7 @@ class AgentContribution(_message.Message):
     LAST_SEEN_NS_FIELD_NUMBER: _builtins.int
     ALIGNMENT_FIELD_NUMBER: _builtins.int
     TARGETS_FIELD_NUMBER: _builtins.int
+    LOCALISATION_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     joined: _builtins.bool
     """True while the agent has a session."""
@@ -911,6 +916,8 @@ class AgentContribution(_message.Message):
     """The highest sequence number of its updates; 0 without any."""
     last_seen_ns: _builtins.int
     """Time of its latest subset or KeepSession, by the server's clock; 0 before the first."""
+    localisation: _geometry_pb2.Localisation.ValueType
+    """As the agent said last; UNSPECIFIED before."""
     @_builtins.property
     def alignment(self) -> Global___FrameAlignment: ...
     @_builtins.property
@@ -936,10 +943,11 @@ class AgentContribution(_message.Message):
         last_seen_ns: _builtins.int = ...,
         alignment: Global___FrameAlignment | None = ...,
         targets: _abc.Iterable[_builtins.str] | None = ...,
+        localisation: _geometry_pb2.Localisation.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["alignment", b"alignment"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_seen_ns", b"last_seen_ns", "last_update_seq", b"last_update_seq", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_seen_ns", b"last_seen_ns", "last_update_seq", b"last_update_seq", "localisation", b"localisation", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -39,6 +39,30 @@ LENS_MODEL_RADTAN: LensModel.ValueType  # 1
 LENS_MODEL_FISHEYE: LensModel.ValueType  # 2
 Global___LensModel: _TypeAlias = LensModel  # noqa: Y015
 
+class _Localisation:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _LocalisationEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Localisation.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    LOCALISATION_UNSPECIFIED: _Localisation.ValueType  # 0
+    LOCALISATION_TRACKED: _Localisation.ValueType  # 1
+    LOCALISATION_DOUBTFUL: _Localisation.ValueType  # 2
+    """The latest frame contradicts the map, or the odometry or its clock has jumped."""
+    LOCALISATION_LOST: _Localisation.ValueType  # 3
+    """Its agent searches its place in the map. When it is found, the correction of its odometry changes once."""
+
+class Localisation(_Localisation, metaclass=_LocalisationEnumTypeWrapper):
+    """Whether a robot's place in its map is known. Frames of one that is not tracked do not change the map."""
+
+LOCALISATION_UNSPECIFIED: Localisation.ValueType  # 0
+LOCALISATION_TRACKED: Localisation.ValueType  # 1
+LOCALISATION_DOUBTFUL: Localisation.ValueType  # 2
+"""The latest frame contradicts the map, or the odometry or its clock has jumped."""
+LOCALISATION_LOST: Localisation.ValueType  # 3
+"""Its agent searches its place in the map. When it is found, the correction of its odometry changes once."""
+Global___Localisation: _TypeAlias = Localisation  # noqa: Y015
+
 @_typing.final
 class Camera(_message.Message):
     """A pinhole camera. The image plane's origin is the top-left corner of the top-left pixel (centres at +0.5)."""

@@ -233,15 +233,20 @@ class FusionClient(ServiceChannel):
         )
         return self._call(self._stub.JoinSession, request)
 
-    def keep_session(self, session_id: str) -> pb.KeepSessionResponse:
-        """Renew the lease; returns what identifies the updates that the server has. Raises SessionUnknownError."""
+    def keep_session(self, session_id: str, localisation: str = "unspecified") -> pb.KeepSessionResponse:
+        """Renew the lease; return what identifies the updates that the server has. Raises SessionUnknownError.
+
+        localisation: of the robot; "tracked", "doubtful" or "lost".
+        """
         if self._owner is not None:
             try:
                 # it knows the latest subsets
-                return self._owner.keep_session(session_id)
+                return self._owner.keep_session(session_id, localisation)
             except UnavailableError:
                 self._leave_owner()
-        return self._call(self._stub.KeepSession, pb.KeepSessionRequest(session_id=session_id))
+        number = geometry_pb2.Localisation.Value(f"LOCALISATION_{localisation.upper()}")
+        request = pb.KeepSessionRequest(session_id=session_id, localisation=number)
+        return self._call(self._stub.KeepSession, request)
 
     def stored_digests(self, session_id: str) -> TileDigests:
         """Return the digests of the updates that the server has of the session's agent."""

@@ -62,7 +62,7 @@ class Uplink:
         # the latest report of objects, and the one that the server has
         self._report: ObjectReport | None = None
         self._sent_report: ObjectReport | None = None
-        self._frame_message = ""
+        self._frame_message, self._localisation = "", "tracked"
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -78,6 +78,13 @@ class Uplink:
         """Send the agent's task and objects with the next round; a newer report replaces one that waits."""
         self._report = report
         self._wake()
+
+    def report_localisation(self, localisation: str) -> None:
+        """Tell the server now, if there is a session, whether the robot is "tracked", "doubtful" or "lost"."""
+        if localisation != self._localisation:
+            self._localisation = localisation
+            self._next_check_s = math.inf if self._session is None else 0.0
+            self._wake()
 
     def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
         """Queue a selected keyframe; replaced: index of the one that it replaces. Raises StorageError."""
@@ -204,7 +211,7 @@ class Uplink:
             # the server did not know the session
             self._join_if_needed()
             return
-        kept = self._client.keep_session(self._session.session_id)
+        kept = self._client.keep_session(self._session.session_id, self._localisation)
         self._next_check_s = time.monotonic() + self._settings.check_interval_s
         if kept.alignment.message != self._frame_message:
             self._frame_message = kept.alignment.message

@@ -20,6 +20,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1.geometry_pb2 import LOCALISATION_DOUBTFUL
 from gausslite.wire.clients import Export, FusionClient
 
 ACCEPTED, STALE, REJECTED = pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE, pb.SUBSET_STATUS_REJECTED
@@ -77,8 +78,11 @@ def test_an_invalid_subset_does_not_end_the_stream() -> None:
         assert ant.last_seen_ns > 0
         session = t.client.join("bee", GRID).session_id
         assert t.client.status().agents[-1].last_seen_ns == 0
+        t.client.keep_session(session, "doubtful")
         t.client.keep_session(session)
-        assert t.client.status().agents[-1].last_seen_ns > 0
+        [_, bee] = t.client.status().agents
+        assert bee.last_seen_ns > 0
+        assert bee.localisation == LOCALISATION_DOUBTFUL
 
 
 def test_a_robot_whose_agent_id_another_one_uses_is_refused(fusion: RunningServer) -> None:

@@ -44,7 +44,9 @@ def test_the_page_shows_who_won_each_voxel_and_what_it_shows(fusion: RunningServ
     page, client = SeenPage(), FusionClient(fusion.client.address)
     panel = FusionPanel(page, client, ServerMemory(client.address))
     try:
+        client.keep_session(client.join("c", GRID).session_id, "lost")
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 3)
+        assert text(page).count("; the robot is lost") == 1
         fused = page.contents
         order = np.argsort(fused.gaussians.means_m[:, 0])
         assert [fused.agents[i] for i in fused.agent[order]] == ["a", "b", "b"]
