@@ -327,11 +327,12 @@ class TaskMapper:
 
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
-        return (
-            None
-            if self._sent_voxels is None
-            else self._sent_voxels.collect_changes(self._mapper.gaussians(active_only=True))
-        )
+        if self._sent_voxels is None:
+            return None
+        unsent = self._mapper.gaussians(active_only=True, unsent_only=True)
+        changes = self._sent_voxels.collect_changes(unsent, self._mapper.pager)
+        self._mapper.pager.mark_sent()
+        return changes
 
     @property
     def loops(self) -> LoopCounts:
@@ -359,7 +360,7 @@ class TaskMapper:
 
     def _skip(self, frame: Frame, reason: str) -> FrameOutcome:
         """Return the outcome of a frame that is not mapped."""
-        count, timing, localisation = self._mapper.table.count, self._scheduler.end(), self.localisation
+        count, timing, localisation = self._mapper.count, self._scheduler.end(), self.localisation
         return FrameOutcome(frame.index, 0, count, 0.0, timing, reason, localisation=localisation)
 
     def _estimate_relevance(self, view: FrameView) -> RelevanceEstimate:
