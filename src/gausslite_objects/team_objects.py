@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from statistics import median
 from threading import Lock
 
 import numpy as np
@@ -118,8 +119,8 @@ def _clusters(
             cluster_of[member] = a
         members[a] += members[b]
         members[b] = []
-        x, y, z = np.median([landmarks[member].centroid_m for member in members[a]], axis=0).tolist()
-        centres[a], reaches[a] = (x, y, z), float(np.median([reaches[a], reaches[b]]))
+        x, y, z = map(median, zip(*(landmarks[member].centroid_m for member in members[a]), strict=True))
+        centres[a], reaches[a] = (x, y, z), 0.5 * (reaches[a] + reaches[b])
     return [own for own in members if own]
 
 
@@ -267,9 +268,11 @@ class TeamObjectIds:
         known = (Counter(self._ids[member] for member in own if member in self._ids) for own in observers)
         claims = sorted((-count, id_, i) for i, counts in enumerate(known) for id_, count in counts.items())
         ids: dict[int, str] = {}
+        taken: set[str] = set()
         for _, id_, i in claims:
-            if i not in ids and id_ not in ids.values():
+            if i not in ids and id_ not in taken:
                 ids[i] = id_
+                taken.add(id_)
         for i in sorted(set(range(len(merged))) - ids.keys(), key=lambda i: observers[i]):
             noun = merged[i].landmark.noun.encode()[:_MAX_NOUN_BYTES].decode(errors="ignore")
             ids[i], self._next = f"team/{noun}-{self._next}", self._next + 1

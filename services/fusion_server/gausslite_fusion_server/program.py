@@ -34,7 +34,6 @@ from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import PROGRAM, FrameUse, ServerSettings, parse_arguments
 
 _log = logging.getLogger(__name__)
-_SWITCH_INTERVAL_S = 0.001  # Python's 5 ms would delay the event loop behind a thread that computes
 _COLLECTION_THRESHOLDS = (2_000, 10, 100)  # a full collection of a large map takes 0.1 s: make it rare
 
 
@@ -72,8 +71,6 @@ def _open_aligner(settings: ServerSettings) -> FrameAligner | None:
 
 
 async def _serve(settings: ServerSettings) -> None:
-    # an acknowledgement passes several threads, and each waits this long for one that computes
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     # a full collection reads every voxel's entry while nobody else works: 0.1 s with 1e7 Gaussians
     gc.set_threshold(*_COLLECTION_THRESHOLDS)
     if settings.peer_address is not None:

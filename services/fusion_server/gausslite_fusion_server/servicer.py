@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
-from gausslite.domain.objects import ObjectReport
+from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.refinement import CreateRasterizer, RefineSettings
@@ -122,6 +122,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
         self._exports, self._queries, self._joins = (WorkerPool(name) for name in ("exports", "queries", "joins"))
         self._keyframes = WorkerPool("keyframes", pause=_KEYFRAME_PAUSE)
+        # the latest answer: thousands of observers take 30 ms of Python to encode
+        self._found: tuple[tuple[TeamObject, ...], pb.QueryObjectsResponse] = (), pb.QueryObjectsResponse()
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -326,7 +328,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def _find_objects(self, noun: str) -> pb.QueryObjectsResponse:
         found = self.engine.query_objects(noun)
-        return pb.QueryObjectsResponse(objects=[object_to_message(one.landmark, one.observers) for one in found])
+        if found != self._found[0]:
+            objects = [object_to_message(one.landmark, one.observers) for one in found]
+            self._found = found, pb.QueryObjectsResponse(objects=objects)
+        return self._found[1]
 
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Render a layer of the map from a camera pose."""

@@ -15,6 +15,8 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.plugins import absent_package
 from gausslite.process import print_message, printable
 
+_SWITCH_INTERVAL_S = 0.001  # Python's 5 ms would delay the event loop behind each thread that computes
+
 
 class LogFormat(StrEnum):
     """How a service writes its log."""
@@ -64,6 +66,7 @@ def log_to_stderr(program: str, log_format: LogFormat = LogFormat.TEXT) -> None:
 def run_service(program: str, serve: Callable[[], Coroutine[Any, Any, int]]) -> int:
     """Run the service and return its exit code; 2 with one line on stderr after a GaussLiteError."""
     log_to_stderr(program)
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
         return asyncio.run(serve())
     except GaussLiteError as error:

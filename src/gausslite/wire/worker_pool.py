@@ -15,16 +15,17 @@ from gausslite.domain.errors import RateLimitError
 from gausslite.wire.security import caller_or_connection
 
 _Result = TypeVar("_Result")
-_RETRY_AFTER_S = 1.0
+_RETRY_AFTER_S, _REFUSAL_PAUSE_S = 1.0, 0.5
 _LONG_S, _MAX_KNOWN = 0.05, 1000
+_TYPICAL_SHARE = 0.25  # of the latest call in the mean of all
 
 
 class WorkerPool:
     """Threads for one kind of work, and who waits for them. Use it on the event loop.
 
-    The next turn is that of the caller whose calls have used least time since it came (start-time fair queueing, Goyal
-    1996): who floods waits behind its own calls, also with several connections. If too many wait, the newest call of
-    the caller with most of them is refused.
+    The next turn is that of the caller who will have used least time since it came when its call ends (self-clocked
+    fair queueing, Golestani 1994; a call is taken to last as its caller's last one): who floods waits behind its own
+    calls, also with several connections. If too many wait, the newest of the caller with most of them is refused.
     """
 
     def __init__(self, name: str, threads: int = 1, waiting: int = 64, pause: float = 0.0) -> None:
@@ -36,6 +37,9 @@ class WorkerPool:
         self._waiting: dict[asyncio.Future[None], str] = {}
         self._running: Counter[str] = Counter()
         self._used_s: dict[str, float] = {}
+        # of each caller's last call, and of all calls for a caller who has had none
+        self._last_s: dict[str, float] = {}
+        self._typical_s = 0.0
         # the used time of the latest turn: who comes now begins with it, so that waiting does not collect turns
         self._now_s = 0.0
 
@@ -87,8 +91,13 @@ class WorkerPool:
             f"{self._name}: expected at most {self._limit} calls that wait, got more, most of them from "
             f"{self._waiting.pop(turn)[:200]}; call again later"
         )
-        if not turn.cancelled():
-            turn.set_exception(RateLimitError(message, retry_after_s=_RETRY_AFTER_S))
+
+        def answer() -> None:
+            if not turn.cancelled():
+                turn.set_exception(RateLimitError(message, retry_after_s=_RETRY_AFTER_S))
+
+        # not at once: who calls again without a pause would keep the event loop busy with refusals
+        asyncio.get_running_loop().call_later(_REFUSAL_PAUSE_S, answer)
 
     def _start_next(self) -> None:
         while self._free and self._waiting:
@@ -102,15 +111,22 @@ class WorkerPool:
             turn.set_result(None)
 
     def _rank(self, caller: str) -> tuple[int, float]:
-        return self._running[caller], self._used_s[caller]
+        return self._running[caller], self._used_s[caller] + self._last_s.get(caller, self._typical_s)
 
     def _end(self, caller: str, begin_s: float) -> None:
         took_s = time.monotonic() - begin_s
         self._used_s[caller] += took_s
+        self._last_s[caller] = took_s
+        self._typical_s += _TYPICAL_SHARE * (took_s - self._typical_s)
         self._running -= Counter([caller])
+        if not self._running and not self._waiting:
+            # after an idle time nobody is behind
+            self._now_s = max(self._used_s.values())
         if len(self._used_s) > _MAX_KNOWN:
             active = {*self._running, *self._waiting.values()}
-            self._used_s = {other: used_s for other, used_s in self._used_s.items() if other in active}
+            self._used_s, self._last_s = (
+                {other: value for other, value in of.items() if other in active} for of in (self._used_s, self._last_s)
+            )
         asyncio.get_running_loop().call_later(self._pause * took_s if took_s > _LONG_S else 0.0, self._free_one)
 
     def _free_one(self) -> None:

@@ -62,6 +62,22 @@ def test_who_floods_waits_behind_its_own_calls() -> None:
     assert with_pool(body).done == ["flood-0", "good-0", *(f"flood-{number}" for number in range(1, 5))]
 
 
+def test_a_caller_of_short_calls_does_not_wait_for_a_long_one_of_each_new_caller() -> None:
+    async def body(pool: WorkerPool, work: Work) -> None:
+        work.released.set()
+        await pool.run(GOOD, work, "before")
+        work.released.clear()
+        work.begun.clear()
+        floods = [Context(f"ipv4:127.0.0.1:{port}") for port in range(6001, 6009)]
+        calls = [await queue(pool, work, flood, flood.peer()) for flood in floods]
+        good = await queue(pool, work, GOOD, "good")
+        await asyncio.sleep(0.05)
+        work.released.set()
+        await asyncio.gather(*good, *(task for call in calls for task in call))
+
+    assert with_pool(body).done[:3] == ["before", "ipv4:127.0.0.1:6001", "good"]
+
+
 def test_a_full_queue_refuses_the_newest_call_of_the_caller_with_most_of_them() -> None:
     async def body(pool: WorkerPool, work: Work) -> None:
         flood = await queue(pool, work, FLOOD, *(f"flood-{number}" for number in range(5)))
@@ -74,6 +90,26 @@ def test_a_full_queue_refuses_the_newest_call_of_the_caller_with_most_of_them() 
         assert await asyncio.gather(*flood, *good) == ["flood-0", "flood-1", "flood-2", "good-0"]
 
     with_pool(body, waiting=3)
+
+
+def test_who_calls_again_at_once_does_not_keep_the_event_loop_busy_with_refusals() -> None:
+    refusals = []
+
+    async def insist(pool: WorkerPool, work: Work) -> None:
+        while True:
+            try:
+                await pool.run(FLOOD, work, "flood")
+            except RateLimitError as refusal:
+                refusals.append(refusal)
+
+    async def body(pool: WorkerPool, work: Work) -> None:
+        await queue(pool, work, FLOOD, "flood-0", "flood-1")
+        again = asyncio.create_task(insist(pool, work))
+        await asyncio.sleep(0.1)
+        again.cancel()
+
+    with_pool(body, waiting=1)
+    assert len(refusals) < 5
 
 
 def test_a_cancelled_call_leaves_the_queue_and_its_thread_stays_taken_until_the_work_has_ended() -> None:
