@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
@@ -12,17 +10,17 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State
-from gausslite.domain.voxels import VoxelBatch, VoxelGrid
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.window_view import WindowView
 
 
 class MapPager:
-    """Keeps the whole map in memory. A plug-in derives from it: it moves what no camera sees to disk, and back in time.
+    """Keeps the whole map in memory. A plug-in derives from it: it moves what no camera sees to disk, and back.
 
-    What is on disk is part of the map, and is not trained. Rows of the table move when parts are stored or loaded.
+    It is called with MapperSettings, the VoxelGrid of what is published, and the bytes that it may use on disk. What is
+    on disk is part of the map, and is not trained. Rows of the table move when parts are stored or loaded.
     """
 
     @property
@@ -71,7 +69,3 @@ class MapPager:
 
     def restore(self, state: State) -> None:
         """Continue from another pager's state. Raises MapFileError."""
-
-
-OpenPager = Callable[[MapperSettings, VoxelGrid, int], MapPager]
-"""The plug-in, with the grid of the voxels that are published and the bytes that it may use on disk."""

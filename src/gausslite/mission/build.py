@@ -16,7 +16,6 @@ from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.pager import MapPager, OpenPager
 from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
 from gausslite.mapping.pose_estimation import CameraTracker, open_tracker
 from gausslite.mission.frame_scheduler import FrameScheduler
@@ -53,13 +52,10 @@ def build_mapper(settings: MissionSettings, prior: Gaussians | None = None, grid
     """
     rasterizer = choose_rasterizer(settings.backend, settings.threads)
     corrector = open_corrector(settings, rasterizer)
-    pager = None if settings.disk_mb == 0 else _open_pager(settings, grid)
-    return GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed, prior, corrector, pager)
-
-
-def _open_pager(settings: MissionSettings, grid: VoxelGrid) -> MapPager:
-    open_plugin: OpenPager = load(Group.PAGERS, purpose="disk-mb")
-    return open_plugin(settings.mapper_settings(), grid, settings.disk_mb * 1_000_000)
+    policy, pager = settings.mapper_settings(), None
+    if settings.disk_mb > 0:
+        pager = load(Group.PAGERS, purpose="disk-mb")(policy, grid, settings.disk_mb * 1_000_000)
+    return GaussianMapper(policy, rasterizer, settings.seed, prior, corrector, pager)
 
 
 def open_corrector(settings: MissionSettings, rasterizer: Rasterizer) -> PoseCorrector | None:
