@@ -38,6 +38,7 @@ class Group(StrEnum):
     POSES = "gausslite.poses"  # refines the poses of views, or tracks the camera; the name is a value of `--poses`
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
+    PAGERS = "gausslite.pagers"  # keeps what no camera sees on disk
     MONITORS = "gausslite.monitors"  # judges whether a robot is where its odometry says, and finds a lost one
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     TEAM_OBJECTS = "gausslite.team_objects"  # merges the objects that a team's robots report

@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "gausslite_objects": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
+    "gausslite_paging": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "disk-mb=10"),),
     "gausslite_relocalisation": (),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
     "gausslite_cluster": (("gausslite_fusion_server", "--store", "postgresql://nowhere.invalid/maps"),),

@@ -12,7 +12,7 @@ from gausslite_bench.team.scenes import HomeTeamPlan
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
-WITHOUT_OUTPUT = ("chaos", "fuzz", "kidnaps", "raster", "server")
+WITHOUT_OUTPUT = ("chaos", "fuzz", "kidnaps", "raster", "server", "tour")
 
 
 @pytest.mark.parametrize(

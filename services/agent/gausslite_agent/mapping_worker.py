@@ -101,7 +101,7 @@ class MappingWorker:
         self._on_change = on_change
         self._load = load or LoadSettings()
         self._clock = clock
-        self._mapper = build_mapper(settings)
+        self._mapper = build_mapper(settings, grid=grid)
         self._sent_voxels = SentVoxelTracker(grid)
         # updates that the spool refused
         self._unpublished = empty_batch()
@@ -165,7 +165,7 @@ class MappingWorker:
         self._last_index = checkpoint.last_index
         # the clock may have been set back since the mission was saved
         self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
-        self._status.update(gaussians=self._mapper.table.count, map_revision=self._map_revision())
+        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
         # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
         # and the server may have voxels that the saved map does not
         self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
@@ -245,8 +245,8 @@ class MappingWorker:
             return
         inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
         if inserted:
-            count, gaussians = self.status().team_gaussians + inserted, self._mapper.table.count
-            self._status.update(team_gaussians=count, gaussians=gaussians, map_revision=self._map_revision())
+            count = self.status().team_gaussians + inserted
+            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
             self._on_change()
 
     @_on_worker

@@ -111,6 +111,11 @@ class KeyframeStore:
         self._keyframes = {frame: self._keyframes[frame] for frame in self._ids()}
         self._views = {frame: self._views[frame] for frame in (*self._recent, *self._long_term)}
 
+    def keep_images(self, keep: Callable[[Keyframe], Keyframe]) -> None:
+        """Replace each keyframe that does not train by what `keep` returns for it."""
+        idle = {frame: keep(keyframe) for frame, keyframe in self._keyframes.items() if frame not in self._views}
+        self._keyframes |= idle
+
     def get(self, frame: FrameId) -> Keyframe | None:
         """Return the keyframe of a frame, or None if none is kept."""
         return self._keyframes.get(frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -32,6 +33,7 @@ from gausslite.mapping.free_space import contradicted_rows, rows_moved_away
 from gausslite.mapping.keyframe_store import KeyframeStore
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.moving import MOTION_REFERENCES, moving_pixels, without_pixels
+from gausslite.mapping.pager import MapPager
 from gausslite.mapping.pose_corrector import PoseCorrector
 from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
 from gausslite.mapping.poses import PoseTable
@@ -46,6 +48,7 @@ from gausslite.mapping.window_view import WindowView, window_view
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 _MAX_KEYFRAMES = 2**31 - 1
+_Pose: TypeAlias = Float64[ndarray, "4 4"]
 _STAYS = np.eye(4)
 _CORRECTED = "T_corrected_odometry"
 _EXTENT_PER_DEPTH = 1.0 / 3.0
@@ -90,15 +93,17 @@ class GaussianMapper:
         seed: int = 0,
         initial_map: Gaussians | None = None,
         corrector: PoseCorrector | None = None,
+        pager: MapPager | None = None,
     ) -> None:
         """Allocate memory for `settings.max_gaussians` Gaussians; seed initialises all random choices.
 
-        initial_map: see `continue_map`. Without a corrector, poses are only refined.
+        initial_map: see `continue_map`. Without a corrector, poses are only refined; without a pager, all is in memory.
         """
         self.settings = settings
         self._rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
         self.table = SplatTable(settings.max_gaussians)
+        self.pager = pager or MapPager()
         self._has_prior = False
         if initial_map is not None:
             self.continue_map(initial_map)
@@ -108,12 +113,17 @@ class GaussianMapper:
             settings.pose_prior, settings.keyframes.pose_updates_per_frame, settings.pose_anchor_share
         )
         self.poses = PoseTable()
-        self._refiner = open_refiner(refinement, self.render, self.poses)
+        self._refiner = open_refiner(refinement, self._render, self.poses)
         self._trainer = Trainer(settings, self.table, rasterizer, self._rng)
         self.corrector = corrector
         self._extent_m = 0.0
         self.revision = 0
         self._skipped = 0
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in memory and on disk."""
+        return self.table.count + self.pager.count
 
     def continue_map(self, earlier: Gaussians) -> None:
         """Add an earlier map. Keyframes that see through it remove its Gaussians; those that show it set active flags.
@@ -131,10 +141,11 @@ class GaussianMapper:
 
     def look(self, frame: Frame, scheduler: StageScheduler) -> FrameView:
         """Return the frame with the map rendered from its pose, unless the scheduler skips seeding."""
+        self.pager.prepare(self.table, frame, self.store.window)
         if self.table.count == 0 or scheduler.skips(SkippableStage.SEEDING):
             return FrameView(frame)
         with scheduler.timing(Stage.RENDERING):
-            rendering = self.render(frame.camera, frame.T_world_camera, frame.motion)
+            rendering = self._render(frame.camera, frame.T_world_camera, frame.motion)
             return FrameView(frame, RenderedView.from_rendering(rendering))
 
     def leave_out_moving(self, view: FrameView, scheduler: StageScheduler) -> FrameView:
@@ -146,7 +157,7 @@ class GaussianMapper:
         if moving is None:
             return view
         with scheduler.timing(Stage.RENDERING):
-            seen = view.rendered or self.render(frame.camera, frame.T_world_camera, frame.motion)
+            seen = view.rendered or self._render(frame.camera, frame.T_world_camera, frame.motion)
         return replace(view, frame=without_pixels(frame, moving, seen.rgb))
 
     def map_view(self, looked: FrameView, relevance: RelevanceMap, scheduler: StageScheduler) -> MappedFrame:
@@ -159,7 +170,7 @@ class GaussianMapper:
         require_array("relevance pixel_weights", relevance.pixel_weights, frame.depth_m.shape, np.float32)
         if defect := frame.defect:
             self._skipped += 1
-            return MappedFrame(frame.index, 0, 0, self.table.count, defect)
+            return MappedFrame(frame.index, 0, 0, self.count, defect)
         is_keyframe = self.store.next_is_keyframe
         self.poses.add(frame, self.store.next_anchor)
         self._refine_keyframes(scheduler)  # earlier poses first: the map has been trained since
@@ -168,8 +179,10 @@ class GaussianMapper:
         motions = self._close_loop(frame, view.keyframe, scheduler) if is_keyframe else None
         if motions is not None:  # before training, which would pull the map to the wrong place
             view = self._window_view(view.keyframe.moved(motions))
+            self.pager.prepare(self.table, view.keyframe.frame, self.store.window)
         iterations = self._train(view, motions, scheduler)  # ROI and MVO with Eq. (2); counts kappa
         self.store.add(view)  # only now: the window has the current view besides
+        self.store.keep_images(self.pager.keep)
         if self._has_prior and is_keyframe:
             self._update_prior(view.keyframe)
         self.revision += 1
@@ -177,7 +190,7 @@ class GaussianMapper:
             frame.index,
             seeded,
             iterations,
-            self.table.count,
+            self.count,
             T_world_camera=view.keyframe.frame.T_world_camera,
             anchor=view.keyframe.anchor,
             T_corrected_earlier=motions,
@@ -185,9 +198,10 @@ class GaussianMapper:
 
     def idle_step(self) -> bool:
         """Run one iteration on the window's keyframes. Return False if there are none yet."""
-        if not self.store.window:
+        window = self.pager.trainable(self.store.window)
+        if not window:
             return False
-        self._trainer.idle_step(self.store.window, self._extent_m)
+        self._trainer.idle_step(window, self._extent_m)
         return True
 
     def reset_roi(self) -> None:
@@ -195,6 +209,7 @@ class GaussianMapper:
 
         The map, kappa and the optimiser state stay; the old ROI is evicted first if the cap is reached.
         """
+        self.pager.reset_roi()
         clear_roi(self.table)  # kappa stays: trained voxels keep their weight in the vote
         self.store.reset_roi()
         self._trainer.reset_roi()
@@ -214,6 +229,7 @@ class GaussianMapper:
         require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
         table, evaluated = self.table, keyframe.with_relevance(relevance)
         self.store.replace_relevance(evaluated, self._window_view)
+        self.pager.show(table, keyframe.frame.camera, keyframe.frame.T_world_camera)
         # earlier Gaussians first: seeds fill only the rest
         update_roi_evidence(table, evaluated.frame, evaluated.relevance)
         if not evaluated.relevance.roi.any():
@@ -233,26 +249,33 @@ class GaussianMapper:
             self.store.replace(completed, None)
             return 0
         self.store.replace_relevance(completed, self._window_view)
+        self.pager.show(self.table, keyframe.frame.camera, keyframe.frame.T_world_camera)
         add_roi_evidence(self.table, keyframe.frame, completed.relevance, added)
         seeds = self._seeder.seed_roi(keyframe.frame, added, self.table.means_m[self.table.active])
         return self._insert(Seeds(seeds, Gaussians.empty(), keyframe.anchor))
 
     def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:
         """Insert a teammate's voxels whose Σkappa exceeds the local one; they replace the local Gaussians there."""
-        inserted = insert_team_voxels(self.table, received, grid)
+        inserted = insert_team_voxels(self.table, self.pager.admit(self.table, received), grid)
         self.revision += inserted.gaussians > 0
         return inserted
 
-    def render(
-        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
-    ) -> Rendering:
+    def render(self, camera: Camera, T_world_camera: _Pose, motion: CameraMotion | None = None) -> Rendering:
         """Render the map from a pose, with a moving camera if motion is given."""
+        self.pager.show(self.table, camera, T_world_camera)
+        return self._render(camera, T_world_camera, motion)
+
+    def _render(self, camera: Camera, T_world_camera: _Pose, motion: CameraMotion | None = None) -> Rendering:
         return self._rasterizer.forward(self.table.rows, camera, inverse(T_world_camera), motion=motion)
 
-    def gaussians(self, active_only: bool = False) -> Gaussians:
-        """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0."""
+    def gaussians(self, active_only: bool = False, unsent_only: bool = False) -> Gaussians:
+        """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0.
+
+        unsent_only: without what was published and is on disk.
+        """
         rows = np.flatnonzero(self.table.active) if active_only else None
-        return self.table.to_gaussians(rows, use_ema=self.settings.optimization.ema_updates > 0)
+        gaussians = self.table.to_gaussians(rows, use_ema := self.settings.optimization.ema_updates > 0)
+        return self.pager.with_stored(gaussians, use_ema, active_only, unsent_only)
 
     def memory_mib(self) -> dict[str, float]:
         """Return the memory in MiB of the table, of Adam's moments and of the keyframes' images."""
@@ -266,6 +289,7 @@ class GaussianMapper:
         """Return everything that the next frame depends on, as views that are valid until then."""
         return {
             **add_prefix("table", self.table.state()),
+            **add_prefix("pages", self.pager.state()),
             **add_prefix("keyframes", self.store.state()),
             **add_prefix("trainer", self._trainer.state()),
             **add_prefix("refiner", {} if self._refiner is None else self._refiner.state()),
@@ -284,7 +308,9 @@ class GaussianMapper:
         after an error.
         """
         self.table.restore(select_prefix(state, "table"))
+        self.pager.restore(select_prefix(state, "pages"))
         self.store.restore(select_prefix(state, "keyframes"), self._window_view)
+        self.store.keep_images(self.pager.keep)
         self._trainer.restore(select_prefix(state, "trainer"))
         if self._refiner is not None:
             self._refiner.restore(select_prefix(state, "refiner"))
@@ -325,7 +351,7 @@ class GaussianMapper:
         """Refine the next keyframes against the map, while there is time and the prior allows an error."""
         if self._refiner is None or self.table.count == 0:
             return
-        for keyframe in self._refiner.next_keyframes(self.store.window):
+        for keyframe in self._refiner.next_keyframes(self.pager.trainable(self.store.window)):
             if not scheduler.has_time_for(Stage.KEYFRAME_REFINEMENT):
                 return
             with scheduler.timing(Stage.KEYFRAME_REFINEMENT):
@@ -344,7 +370,7 @@ class GaussianMapper:
                 contradicting = [*frames[:chosen], *later]
                 # they show where the thing was
                 self.table.remove(rows_moved_away(self.table.means_m, frames[chosen], moved, contradicting))
-                rendered = self.render(frames[chosen].camera, frames[chosen].T_world_camera, frames[chosen].motion)
+                rendered = self._render(frames[chosen].camera, frames[chosen].T_world_camera, frames[chosen].motion)
                 self.store.replace(keyframes[chosen].hide(moved, rendered.rgb), self._window_view)
         moving = moving_pixels(frame, frames)
         return moving if moving.any() else None
@@ -360,9 +386,11 @@ class GaussianMapper:
             return None
         search = scheduler.has_time_for(Stage.LOOP_CLOSURE)
         with scheduler.timing(Stage.LOOP_CLOSURE):
+            self.pager.show(self.table, keyframe.frame.camera, keyframe.frame.T_world_camera)  # what a drift hides
             motions = self.corrector.add(keyframe, prior, self.store.kept if search else (), self.table)
             if motions is None:
                 return None
+            self.pager.move(motions)
             move_with_anchors(self.table, motions)  # map, keyframes and poses move together
             self.store.move(motions)
             self.poses.move(motions)
@@ -378,7 +406,7 @@ class GaussianMapper:
         frame, table = keyframe.frame, self.table
         # rendered from the pose before refinement
         if (rendered is None or keyframe.recorded is not None) and table.count:
-            rendered = RenderedView.from_rendering(self.render(frame.camera, frame.T_world_camera, frame.motion))
+            rendered = RenderedView.from_rendering(self._render(frame.camera, frame.T_world_camera, frame.motion))
         with scheduler.timing(Stage.SEEDING):
             share = self.settings.seeding.background_share
             max_active = round((1.0 - share) * table.capacity) if share > 0 else None
@@ -404,7 +432,7 @@ class GaussianMapper:
         motions: of the keyframes by a loop, or None. The views that it moved train once more, because the map was
         trained from other poses.
         """
-        window = self.store.window
+        window = self.pager.trainable(self.store.window)
         views = (*window, current) if self.settings.components.mvo else (current,)
         done = self._trainer.train(views, self._extent_m, scheduler)
         moved = [] if motions is None else [view for view in window if (motions[view.keyframe.anchor] != _STAYS).any()]

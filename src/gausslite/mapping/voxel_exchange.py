@@ -12,7 +12,10 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
 from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelIndex, merge_batches, select_voxels, tombstones
+from gausslite.mapping.pager import MapPager
 from gausslite.mapping.splat_table import SplatTable
+
+_WHOLE_MAP = MapPager()
 
 
 class SentVoxelTracker:
@@ -27,20 +30,22 @@ class SentVoxelTracker:
         self._tracker = VoxelChangeTracker()
         self._frozen = np.zeros(0, np.int64)
 
-    def collect_changes(self, gaussians: Gaussians) -> VoxelBatch:
+    def collect_changes(self, gaussians: Gaussians, pager: MapPager = _WHOLE_MAP) -> VoxelBatch:
         """Return updates of the voxels whose active Gaussians are new or changed since the last call.
 
-        A voxel that has lost all active Gaussians gets a tombstone (count 0), unless it is frozen.
+        A voxel that has lost all active Gaussians gets a tombstone (count 0), unless it is frozen. One of which
+        the pager holds a part, which is not among the Gaussians, waits for it.
         """
         active = gaussians if gaussians.active.all() else gaussians.take(gaussians.active)
         voxels = VoxelIndex.from_points(active.means_m, self._grid)
         signatures = VoxelSignatures.from_gaussians(active, voxels)
-        selected = self._may_replace(
-            signatures.keys, signatures.kappa_sums
-        )  # the server keeps what an earlier task trained better
+        # the server keeps what an earlier task trained better
+        selected = self._may_replace(signatures.keys, signatures.kappa_sums) & ~pager.holds(signatures.keys)
         current = signatures.select(selected)
         changed = np.zeros(len(signatures.keys), np.bool_)
-        changed[selected], removed = self._tracker.update(current, retained=self._frozen)
+        sent = self._tracker.signatures.keys
+        retained = np.concatenate([self._frozen, sent[pager.holds(sent)]])
+        changed[selected], removed = self._tracker.update(current, retained)
         self._frozen = np.setdiff1d(self._frozen, current.keys, assume_unique=True)
         counts = voxels.counts[changed].astype(np.uint32)
         rows = voxels.rows_in(changed)

@@ -14,6 +14,7 @@ from gausslite.domain.objects import NounMatch
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
 from gausslite.mapping.pose_estimation import CameraTracker, open_tracker
@@ -38,19 +39,23 @@ from gausslite.render.rasterizer import Rasterizer
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
+_GRID = VoxelGrid()
 OpenMonitor = Callable[[PriorMap | None, bool | None], LocalisationMonitor]
 """The plug-in of `gausslite.monitors`, with the earlier map that the mission continues, if any, and whether live frames
 are compared with each other in the background; None: a recording's frames, which were compared before."""
 
 
-def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> GaussianMapper:
-    """Return a mapper with an empty map, or with an earlier one to continue.
+def build_mapper(settings: MissionSettings, prior: Gaussians | None = None, grid: VoxelGrid = _GRID) -> GaussianMapper:
+    """Return a mapper with an empty map, or with an earlier one to continue. grid: of the voxels that are published.
 
     Raises KernelError, InvalidInputError, MissingPluginError, QuotaError if the earlier map exceeds max-gaussians.
     """
     rasterizer = choose_rasterizer(settings.backend, settings.threads)
     corrector = open_corrector(settings, rasterizer)
-    return GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed, prior, corrector)
+    policy, pager = settings.mapper_settings(), None
+    if settings.disk_mb > 0:
+        pager = load(Group.PAGERS, purpose="disk-mb")(policy, grid, settings.disk_mb * 1_000_000)
+    return GaussianMapper(policy, rasterizer, settings.seed, prior, corrector, pager)
 
 
 def open_corrector(settings: MissionSettings, rasterizer: Rasterizer) -> PoseCorrector | None:

@@ -254,7 +254,8 @@ class MissionSettings:
 
     policy: str = option(TASK, "how the map is seeded and trained", metavar="NAME", choices=tuple(sorted(POLICIES)))
     disabled: frozenset[str] = option(frozenset(), _DISABLE_HELP, key="disable", metavar="A,B")
-    max_gaussians: int = option(DEFAULT_MAX_GAUSSIANS, "upper limit of the map's size", low=1)
+    max_gaussians: int = option(DEFAULT_MAX_GAUSSIANS, "largest map; with disk-mb, its part in memory", low=1)
+    disk_mb: int = option(0, "disk space for what no camera sees; 0: all of the map is in memory", unit="MB", low=0)
     iterations: int | None = option(
         None,
         "iterations per frame (default: 8)",

@@ -331,8 +331,12 @@ class TaskMapper:
 
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
-        sent = self._sent_voxels
-        return None if sent is None else sent.collect_changes(self._mapper.gaussians(active_only=True))
+        if self._sent_voxels is None:
+            return None
+        unsent = self._mapper.gaussians(active_only=True, unsent_only=True)
+        changes = self._sent_voxels.collect_changes(unsent, self._mapper.pager)
+        self._mapper.pager.mark_sent()
+        return changes
 
     @property
     def loops(self) -> LoopCounts:
@@ -360,7 +364,7 @@ class TaskMapper:
 
     def _skip(self, frame: Frame, reason: str) -> FrameOutcome:
         """Return the outcome of a frame that is not mapped."""
-        count, timing, localisation = self._mapper.table.count, self._scheduler.end(), self.localisation
+        count, timing, localisation = self._mapper.count, self._scheduler.end(), self.localisation
         return FrameOutcome(frame.index, 0, count, 0.0, timing, reason, localisation=localisation)
 
     def _estimate_relevance(self, view: FrameView) -> RelevanceEstimate:

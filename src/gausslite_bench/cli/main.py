@@ -21,6 +21,7 @@ from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, 
 from gausslite_bench.report import Report
 from gausslite_bench.server.bench import ServerBenchSettings, run_server
 from gausslite_bench.team.frame_attacks import FrameAttackSettings, run_frame_attacks
+from gausslite_bench.tour import TourSettings, run_tour
 
 
 def _measured(
@@ -77,6 +78,10 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
     "kidnaps": (
         _of_settings(KidnapSettings, run_kidnaps),
         "a robot that is carried, covered or restarted in a recording",
+    ),
+    "tour": (
+        _of_settings(TourSettings, run_tour),
+        "a tour through many homes and back: memory, disk, and what is left of the first one",
     ),
     "fuzz": (_of_settings(FuzzSettings, run_fuzz), "mutated messages for the codec and every method of the services"),
 }
