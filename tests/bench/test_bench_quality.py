@@ -240,3 +240,14 @@ def test_the_ablation_uses_the_requested_budget(tmp_path: Path) -> None:
     budgets = {(each["budget"]["equal"], each["budget"]["rate_hz"]) for each in report["trials"]}
     assert budgets == {("time", 200.0)}
     assert len(report["trials"]) == len(cumulative_variants())
+
+
+@pytest.mark.slow
+def test_a_growing_quantity_has_a_table_and_a_plot(tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
+    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    options = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "2", "--steps", "1,2"]
+    main(["bench", "compute", "--out", str(tmp_path), *options, "--max-gaussians", "500", "--threads", "1"])
+    report = json.loads((tmp_path / "compute.json").read_text())
+    assert [each["budget"]["iterations"] for each in report["trials"]] == [1, 1, 2, 2]
+    assert "<polyline" in (tmp_path / "compute.svg").read_text()

@@ -108,11 +108,9 @@ def run_compute(options: argparse.Namespace) -> int:
     steps = chosen.steps or _GROWTH_STEPS[chosen.quantity]
     variants = [Variant(name, name) for name in chosen.policies]
     # wrong values fail here, before hours of work
-    studies = {
-        step: _study(_with_step(options, chosen.quantity, step), chosen.pairs, (_ABLATION_TASK,), variants)
-        for step in steps
-    }
-    results = {step: _run(options, study) for step, study in studies.items()}
+    stepped = {step: _with_step(options, chosen.quantity, step) for step in steps}
+    studies = {step: _study(own, chosen.pairs, (_ABLATION_TASK,), variants) for step, own in stepped.items()}
+    results = {step: _run(stepped[step], study) for step, study in studies.items()}
     found = curves(results)
     table = growth_table(chosen.quantity, steps, found)
     trials = [trial for step in results.values() for trial in step.trials_as_json()]
