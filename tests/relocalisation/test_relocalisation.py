@@ -186,7 +186,7 @@ HOMES = {
 )
 def test_a_mission_without_an_event_is_mapped_as_if_nobody_watched(address: str) -> None:
     home = open_source(address)
-    frames = [home.frame(position, (160, 120)) for position in range(0, 40, 2)]
+    frames = [home.frame(position, (160, 120)) for position in range(0, 40 if "blur" in address else 20, 2)]
     watched, unwatched = _mission(), _mission(False)
     assert {(outcome.skipped, outcome.localisation) for outcome in _process(watched, frames)} == {(None, TRACKED)}
     _process(unwatched, frames)

@@ -76,6 +76,7 @@ def test_words_with_shades_two_colours_and_unknown_words():
     assert match_word("blue", no_colours()) is Fit.DOUBTFUL
 
 
+@pytest.mark.slow
 def test_no_right_colour_of_a_simulated_home_is_excluded():
     """On a home that did not serve to set the ranges; `tools/score_colours.py` scores all homes."""
     scores = load_tool("score_colours").score([4], 3, "240x180", (1.0, 1.0, 1.0))
