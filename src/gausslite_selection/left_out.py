@@ -11,6 +11,7 @@ from gausslite.perception.object_map import Observation
 from gausslite.perception.relations import RelationFilter, conditions_of
 from gausslite.perception.selector import Selector, TaskObjects, anchors_of
 
+_TOUCHING_M = 0.05  # no distance to speak of
 _WITHOUT_DISTANCE = (Predicate.BETWEEN, Predicate.CLOSEST_TO, Predicate.FARTHEST_FROM)
 
 
@@ -52,6 +53,7 @@ def _nearest(relation: Relation, seen: Sequence[Observation], objects: TaskObjec
         for each in seen
         for anchor in anchors_of(relation, each, objects)
     ]
-    if not distances_m or relation.predicate in _WITHOUT_DISTANCE:
+    nearest_m = min(distances_m, default=0.0)
+    if nearest_m < _TOUCHING_M or relation.predicate in _WITHOUT_DISTANCE:
         return ""
-    return f": the nearest is {min(distances_m):.1f} m away"
+    return f": the nearest is {nearest_m:.1f} m away"
