@@ -111,7 +111,7 @@ def select(place: MappedObjects, question: str) -> tuple[Sequence[TeamObject], S
     answer: Callable[..., Answer] = load(Group.QUESTIONS, purpose="questions")
 
     def ask(asked: Sequence[TeamObject]) -> Answer:
-        return answer(graph, [each.landmark for each in asked], place.up_axis, place.T_world_camera)
+        return answer(graph, [team_object.landmark for team_object in asked], place.up_axis, place.T_world_camera)
 
     found = ask(objects)
     if not found.objects and (elsewhere := ask(place.objects).objects):
