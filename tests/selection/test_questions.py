@@ -52,6 +52,7 @@ def test_a_question_selects_the_objects_that_its_graph_means(question: str, expe
 def test_an_anchor_that_the_map_does_not_have_selects_nothing_and_is_named() -> None:
     found = gl.ask(ROOM, "what is on the shelf")
     assert (found.objects, found.notes) == ((), ("the map has no 'shelf'",))
+    assert gl.ask(ROOM, "mug under the table").notes == ("2 'mug' seen, none under the 'table'",)
 
 
 def test_colours_are_named_as_not_evaluated() -> None:
