@@ -34,6 +34,7 @@ _REFIT_SHARE = 0.25
 """A comparison is due when so many voxels have changed since the last one, as a share of the agent's voxels."""
 _MAX_WITNESSES = 4
 _PLACE_GRID = VoxelGrid(0.5)
+_NO_KEYS = np.zeros(0, np.int64)
 _Witness = tuple[str, SurfaceSamples]
 """An agent that another one is compared with, and its samples."""
 
@@ -43,7 +44,7 @@ class _News:
     """What has happened to an agent's map since the last poll. is_deleted: first, all data from before."""
 
     is_deleted: bool = False
-    keys: set[int] = field(default_factory=set)
+    keys: list[Int64[ndarray, " _"]] = field(default_factory=list)
     changed: int = 0
 
 
@@ -57,7 +58,7 @@ class _AgentMap:
     """
 
     frame_id: int = 0
-    unread: set[int] = field(default_factory=set)
+    unread: Int64[ndarray, " _"] = field(default_factory=lambda: _NO_KEYS)
     changed: int = 0
     is_new: bool = False
     compared: int = 0
@@ -99,7 +100,7 @@ class MapAligner:
         """Note that these voxels of an agent have changed."""
         with self._lock:
             news = self._news.setdefault(agent_id, _News())
-            news.keys.update(keys.tolist())
+            news.keys.append(keys)
             news.changed += len(keys)
 
     def forget(self, agent_id: str) -> None:
@@ -138,7 +139,7 @@ class MapAligner:
             if own.is_deleted:
                 self._delete(agent_id)
             if own.keys and agent_id in self._maps:
-                self._maps[agent_id].unread |= own.keys
+                self._maps[agent_id].unread = np.unique(np.concatenate([self._maps[agent_id].unread, *own.keys]))
                 self._maps[agent_id].changed += own.changed
                 self._maps[agent_id].is_new = True
         stored = team.store.agents()
@@ -153,7 +154,7 @@ class MapAligner:
 
     def _add(self, agent_id: str, team: TeamView) -> None:
         """Add a map that is new here, or under its name."""
-        unread = set(team.store.keys(agent_id).tolist())
+        unread = team.store.keys(agent_id)
         own = self._maps[agent_id] = _AgentMap(unread=unread, changed=len(unread), is_new=True)
         if agent_id in team.frames and team.frames[agent_id][1].segments:
             own.first_seq = team.store.totals(agent_id).highest_update_seq + 1
@@ -220,8 +221,8 @@ class MapAligner:
     def _read(self, agent_id: str, team: TeamView) -> None:
         """Read the voxels that changed since the last time, as far as they are sampled."""
         own = self._maps[agent_id]
-        own.samples.read(team, agent_id, own.samples.select(np.array(sorted(own.unread), np.int64), self._grid))
-        own.unread = set()
+        own.samples.read(team, agent_id, own.samples.select(own.unread, self._grid))
+        own.unread = _NO_KEYS
 
     def _witnesses(self, agent_id: str, source: SurfaceSamples, team: TeamView, frames: _Frames) -> Iterator[_Witness]:
         """Yield the agents to compare with: those that share most with it, and those that it contradicts."""
@@ -309,6 +310,8 @@ class MapAligner:
                 continue
             is_first = not has_reference and not before.segments
             is_even = any(majority.is_even(name, other) for other in against)
+            if not (name in verified or against or is_first or self._maps[name].compared):
+                continue
             doubt = "" if name in verified else self._doubt(name, verified)
             after = in_state(before, against, name in quarantined, is_first, is_even, doubt)
             has_reference |= after.is_used and not after.segments
@@ -346,13 +349,13 @@ class MapAligner:
         return max(groups, key=len, default=[])
 
     def _doubt(self, agent_id: str, verified: Sequence[str]) -> str:
-        """Return why nothing shows that the agent's frame is that of these ones."""
-        if not self._maps[agent_id].compared:
-            return "frame: not verified yet"
+        """Return why nothing shows that the agent's frame is that of these ones, which others will join."""
         others = [name for name in verified if not is_former(name) and name != agent_of(agent_id)]
-        if shared := [name for name in others if frozenset((agent_id, name)) in self._comparisons]:
-            return f"frame: not verified: what it shares with {_listed(shared)} does not tell whether it is one place"
-        return f"frame: not verified: it shares no place with {_listed(others) or 'others'}"
+        for name in others:
+            if frozenset((agent_id, name)) in self._comparisons:
+                return f"frame: not verified: what it shares with {name} does not tell whether it is one place"
+        team = " or those that agree with it" if len(others) > 1 else ""
+        return f"frame: not verified: it shares no place with {others[0] if others else 'others'}{team}"
 
     def _contradictions(self, agent_id: str, majority: Majority, quarantined: Collection[str]) -> dict[str, FrameFit]:
         """Return the fits of the used agents that this one contradicts, or differs from while neither leads."""
@@ -365,11 +368,6 @@ class MapAligner:
             and name in majority.supporters
             and (comparison.contradicting or (corrects(comparison.fit) and majority.is_even(agent_id, name)))
         }
-
-
-def _listed(names: Collection[str]) -> str:
-    first = ", ".join([*names][:_MAX_WITNESSES])
-    return f"{first} and {len(names) - _MAX_WITNESSES} more" if len(names) > _MAX_WITNESSES else first
 
 
 def _counted(before: Mapping[str, int], members: Collection[str], is_new: bool) -> dict[str, int]:

@@ -65,7 +65,7 @@ def test_maps_of_two_places_are_quarantined_or_said_to_be_unverified() -> None:
     engine = engine_of(ant=scan(0), bee=away, cat=scan(1))
     bee = alignment_of(engine, "bee")
     assert (bee.state, bee.is_used) == (AlignmentState.UNKNOWN, True)
-    assert bee.message == "frame: not verified: it shares no place with ant, cat"
+    assert bee.message == "frame: not verified: it shares no place with ant or those that agree with it"
     require_told(engine)
 
 
