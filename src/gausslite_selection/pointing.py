@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Final
 
 import cv2
@@ -12,6 +13,7 @@ from jaxtyping import Bool
 from numpy import ndarray
 
 from gausslite.domain.camera import back_project, project
+from gausslite.domain.checks import describe
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
@@ -74,6 +76,9 @@ def mask_on_image(
     """Return the mask of points and boxes as `region_on_image` does. Raises InvalidInputError."""
     if not (points_px or boxes_px):
         raise InvalidInputError("points: expected at least one point or box, got none")
+    for name, count, listed in (("points_px", 2, points_px), ("boxes_px", 4, boxes_px)):
+        for numbers in listed:
+            _require_numbers(name, numbers, count)
     settings = PointingSettings()
     mask = np.zeros(frame.depth_m.shape, np.bool_)
     for x, y in points_px:
@@ -94,6 +99,7 @@ def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> R
 
 def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tuple[Frame, Bool[ndarray, "h w"]]:
     """Return the frame that shows a point best, and the mask as `region_at` grows it. Raises InvalidInputError."""
+    _require_numbers("point_m", point_m, 3)
     settings = PointingSettings()
     best: tuple[tuple[int, float], Frame, tuple[int, int]] | None = None
     for frame in frames:
@@ -105,6 +111,13 @@ def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tup
         raise InvalidInputError(f"target {place}: expected a point on a surface that a frame shows, none shows it")
     _, frame, (row, column) = best
     return frame, _grown(frame, row, column, settings)
+
+
+def _require_numbers(name: str, value: object, count: int) -> None:
+    """Raise InvalidInputError unless the value is so many numbers."""
+    numbers = list(value) if isinstance(value, tuple | list | np.ndarray) else []
+    if len(numbers) != count or not all(isinstance(number, Real) for number in numbers):
+        raise InvalidInputError(f"{name}: expected {count} numbers each, got {describe(value)}")
 
 
 def pointed_masks(

@@ -107,7 +107,7 @@ def require_up_axis(up_axis: UpAxis) -> None:
 
 def unit_up_axis(up_axis: UpAxis) -> UpAxis:
     """Return the normalised up axis. Raises InvalidInputError if it has no direction."""
-    length = float(np.linalg.norm(up_axis))
+    length = np.nan if isinstance(up_axis, str) else float(np.linalg.norm(up_axis))
     if not (np.isfinite(length) and length > 1e-6):
         raise InvalidInputError(f"up axis: expected a finite vector that is not zero, got {up_axis}")
     x, y, z = (float(value) / length for value in up_axis)
