@@ -101,6 +101,24 @@ class _Tiles:
         return self.index.rows[start : start + self.index.counts[tile]]
 
 
+def _chosen_views(
+    seen: Bool[ndarray, "v t"], counts: Int64[ndarray, " t"], limit: int, near: int
+) -> Bool[ndarray, " v"]:
+    """Return all views if there is room for what they see, else the first one and those of the `near` next that fit.
+
+    A few views of another place would spoil what only its other views have seen.
+    """
+    if counts[seen.any(axis=0)].sum() <= limit:
+        return np.ones(len(seen), np.bool_)
+    chosen, needed = np.zeros(len(seen), np.bool_), seen[0]
+    chosen[0] = True
+    for view in range(1, near + 1):
+        both = needed | seen[view]
+        if counts[both].sum() <= limit:
+            chosen[view], needed = True, both
+    return chosen
+
+
 class DiskPager(MapPager):
     """Owns the parts of one map that are on disk. Not thread-safe."""
 
@@ -145,20 +163,21 @@ class DiskPager(MapPager):
         bounds_m = np.concatenate([tiles.bounds_m, self._bounds_m()])
         counts = np.concatenate([tiles.index.counts, np.array([part.count for part in self._parts], np.int64)])
         names = np.concatenate([tiles.names, self._stored_tiles()])
-        frusta, ready = [self._seen_from(frame)], []
-        needed = frusta[0].sees(bounds_m)
-        for view in sorted(window, key=self._distance_m):
-            frustum = self._seen_from(view.keyframe.frame)
-            both = needed | frustum.sees(bounds_m)
-            if counts[both].sum() <= limit:
-                needed = both
-                frusta.append(frustum)
-                ready.append(view.keyframe.frame.id.number)
-        self._needed, self._ready = np.unique(names[needed]), frozenset(ready)
+        views = sorted(window, key=self._distance_m)
+        frusta = [self._seen_from(frame), *(self._seen_from(view.keyframe.frame) for view in views)]
+        seen = np.stack([frustum.sees(bounds_m) for frustum in frusta])
+        chosen = _chosen_views(seen, counts, limit, sum(self._distance_m(view) <= frusta[0].reach_m for view in views))
+        frusta = [frustum for frustum, is_chosen in zip(frusta, chosen, strict=True) if is_chosen]
+        needed = seen[chosen].any(axis=0)
+        self._needed = np.unique(names[needed])
+        self._ready = frozenset(
+            view.keyframe.frame.id.number for view, is_chosen in zip(views, chosen[1:], strict=True) if is_chosen
+        )
         near_m = distances_m(self._eye_m, *self._bounds_m().swapaxes(0, 1))
         wanted = needed[len(tiles.names) :]
         parts = [self._parts[i] for i in np.argsort(near_m, kind="stable") if wanted[i]]
-        self._exchange(table, parts, frusta, limit)
+        # views would train what they see through unfinished walls, and those that show it wait: it leaves memory
+        self._exchange(table, parts, frusta, limit if chosen.all() else 0)
         if parts:
             # corrections have moved what was loaded
             tiles = _Tiles.of(table, self._grid)
