@@ -184,12 +184,12 @@ class _Recording:
 
 def _mirrored(frame: Frame) -> Frame:
     """Return what the camera would record if left and right of the world changed places."""
-    mirror, camera = np.diag([-1.0, 1.0, 1.0, 1.0]), frame.camera
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     return replace(
         frame,
         rgb=np.ascontiguousarray(frame.rgb[:, ::-1]),
         depth_m=np.ascontiguousarray(frame.depth_m[:, ::-1]),
-        camera=replace(camera, cx_px=camera.width_px - camera.cx_px),
+        camera=frame.camera.mirrored(),
         T_world_camera=mirror @ frame.T_world_camera @ mirror,
     )
 

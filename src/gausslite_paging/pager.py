@@ -260,7 +260,9 @@ class DiskPager(MapPager):
         for part, (tile, count, corrections, tasks, size, crc, of_page, of_part) in enumerate(numbers.tolist()):
             page = Page(tuple(islice(blocks, of_page)), size, crc)
             own = np.array(list(islice(anchors, of_part)), np.int64)
-            self._parts.append(_Part(tile, count, page, corrections, tasks, bounds_m[part].copy(), own))
+            self._parts.append(
+                _Part(tile, count, page, corrections, tasks, bounds_m=bounds_m[part].copy(), anchors=own)
+            )
         self._corrections = {
             int(i): get_array(state, f"corrections/{i}", (None, 4, 4), np.float64).copy()
             for i in select_prefix(state, "corrections")
@@ -355,7 +357,9 @@ class DiskPager(MapPager):
             return False
         self._unsent.add(tile)
         anchors = np.unique(packed["anchor"]).astype(np.int64)
-        self._parts.append(_Part(tile, len(rows), page, self._corrected, self._tasks, bounds_m.copy(), anchors))
+        self._parts.append(
+            _Part(tile, len(rows), page, self._corrected, self._tasks, bounds_m=bounds_m.copy(), anchors=anchors)
+        )
         return True
 
     def _limit(self, table: SplatTable, pixels: int) -> int:
@@ -370,7 +374,7 @@ class DiskPager(MapPager):
 
     def _reach_m(self, camera: Camera, depth_m: float) -> float:
         """Return the distance from the eye of this depth in a corner of the image, with a margin."""
-        x, y = camera.width_px / (2 * camera.fx_px), camera.height_px / (2 * camera.fy_px)
+        x, y = camera.unit_depth_size(camera.width_px / 2, camera.height_px / 2)
         return _REACH_MARGIN * min(depth_m, self._settings.seeding.max_depth_m) * float(np.hypot(np.hypot(x, y), 1.0))
 
     def _distance_m(self, view: WindowView) -> float:

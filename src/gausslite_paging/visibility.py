@@ -28,8 +28,8 @@ class Frustum:
     def of(cls, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], reach_m: float) -> Frustum:
         """Return the view of a camera that sees nothing beyond reach_m."""
         x_px, y_px = _MARGIN * camera.width_px, _MARGIN * camera.height_px
-        left, right = (-x_px - camera.cx_px) / camera.fx_px, (camera.width_px + x_px - camera.cx_px) / camera.fx_px
-        top, bottom = (-y_px - camera.cy_px) / camera.fy_px, (camera.height_px + y_px - camera.cy_px) / camera.fy_px
+        left, top = camera.slopes(-x_px, -y_px)
+        right, bottom = camera.slopes(camera.width_px + x_px, camera.height_px + y_px)
         planes = np.array([[0, 0, 1], [1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]], np.float64)
         planes /= np.linalg.norm(planes, axis=1, keepdims=True)
         eye_m = T_world_camera[:3, 3]

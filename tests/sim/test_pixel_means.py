@@ -15,6 +15,7 @@ pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`"
 
 RAYS = 64
 BOUND_DB, LEAST_PX = 40.0, 60
+CAMERA = Camera.centred(0.85 * 320, 320, 240)
 
 
 def mean_of_rays(scene: HomeScene, camera: RayCamera) -> np.ndarray:
@@ -45,14 +46,13 @@ def psnr_db(squares: np.ndarray) -> float:
     return float(10 * np.log10(255.0**2 / max(squares.mean(), 1e-9)))
 
 
-def scores_db(home: int, views: tuple[tuple[int, int], ...], width_px: int = 320) -> dict[str, float]:
+def scores_db(home: int, views: tuple[tuple[int, int], ...]) -> dict[str, float]:
     """Return the PSNR of each object over all views in which it shows."""
-    pinhole = Camera.centred(0.85 * width_px, width_px, width_px * 3 // 4)
     plan = plan_home(home, seed=0)
     scene = HomeScene(plan)
     squares: dict[int, list[np.ndarray]] = {}
     for trajectory, frame in views:
-        camera = RayCamera(pinhole, plan.trajectories[trajectory](10)[frame])
+        camera = RayCamera(CAMERA, plan.trajectories[trajectory](10)[frame])
         view = render_view(scene, camera)
         errors = np.clip(view.rgb, 0, 255) - np.clip(mean_of_rays(scene, camera), 0, 255)
         for item in np.unique(view.item):
@@ -62,7 +62,7 @@ def scores_db(home: int, views: tuple[tuple[int, int], ...], width_px: int = 320
 
 
 def test_the_two_room_homes_objects_are_within_the_bound() -> None:
-    scores = scores_db(0, ((0, 2),), 200)
+    scores = scores_db(0, ((0, 2),))
     assert {"mug", "newspaper", "chair_1", "books"} <= scores.keys()
     assert {name: score for name, score in scores.items() if score < BOUND_DB} == {}
 

@@ -102,6 +102,10 @@ class Camera:
         """Return the camera with its focal lengths multiplied, about the principal point."""
         return replace(self, fx_px=self.fx_px * factor, fy_px=self.fy_px * factor)
 
+    def mirrored(self) -> Camera:
+        """Return the camera for the image in which left and right have changed places."""
+        return replace(self, cx_px=self.width_px - self.cx_px)
+
     def magnification(self, other: Camera) -> tuple[float, float]:
         """Return how many times more columns and rows than the other camera this one shows the same angle with."""
         return self.fx_px / other.fx_px, self.fy_px / other.fy_px
