@@ -6,6 +6,7 @@ handler is our own and not the system's default, because process 1 of a containe
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -181,6 +182,12 @@ class DeferredInterrupt:
 def disable_telemetry() -> None:
     """Set the variables for this process and its children."""
     os.environ.update(_SWITCHES)
+
+
+def return_free_memory() -> None:
+    """Give memory that was freed back to the system, where its C library can."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def size_text(count: float) -> str:

@@ -17,7 +17,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.traffic import Acknowledgements
 from gausslite.pages import load_pages
 from gausslite.plugins import Group, find, load, names
-from gausslite.process import print_message
+from gausslite.process import print_message, return_free_memory
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
@@ -79,6 +79,8 @@ async def _serve(settings: ServerSettings) -> None:
     with contextlib.closing(open_store(settings)) as store:
         aligner = _open_aligner(settings)
         engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, aligner=aligner)
+        # the first vote on a whole map takes several times the memory that stays
+        return_free_memory()
         servicer = FusionServicer(engine, settings.refine, partial(choose_rasterizer, settings.rasterizer))
         try:
             await _serve_mission(settings, engine, servicer)
