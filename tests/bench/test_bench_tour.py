@@ -22,4 +22,5 @@ def test_a_short_tour_returns_to_a_home_that_was_on_disk(capsys: pytest.CaptureF
     assert [row["mapped"] for row in homes] == [8, 8, 8, 2]
     assert homes[2]["gaussians"] > homes[2]["in_memory"]
     assert max(row["in_memory"] for row in homes) <= 3000
-    assert report["psnr"]["before_return"] == pytest.approx(report["psnr"]["left"], abs=0.05)
+    # what is still in memory may train on; what is on disk is not lost
+    assert report["psnr"]["before_return"] > report["psnr"]["left"] - 0.05
