@@ -46,7 +46,7 @@ class BudgetMode(StrEnum):
 class TrialBudget:
     """Limits for every policy: the number of Gaussians, and per frame the iterations or 1 / rate_hz seconds.
 
-    rate_hz None with equal time: the rate must still be measured (`equal_time`).
+    rate_hz None with equal time: the rate must still be measured.
     """
 
     max_gaussians: int = 60_000
