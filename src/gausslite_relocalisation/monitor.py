@@ -134,17 +134,20 @@ class FrameMonitor(LocalisationMonitor):
 
     def state(self) -> State:
         """Return the state, the counts, the odometry's steps and the piece; frames that wait are not saved."""
-        counts = self._known, self._doubts, self._found, self._joined, self._left
+        counts = self._known, self._doubts, self._found
         return {
             "counts": int_array(self._localisation, self._since, self._doubtful, *counts),
+            "pieces": int_array(self._joined, self._left),
             **add_prefix("steps", self._steps.state()),
             **add_prefix("piece", self._saved_piece if self._piece is None else self._piece.state()),
         }
 
     def restore(self, state: State) -> None:
         """Continue from another monitor's state. Raises MapFileError, PoseError."""
-        localisation, self._since, self._doubtful, *counts = get_counts(state, "counts", 8)
-        self._known, self._doubts, self._found, self._joined, self._left = counts
+        localisation, self._since, self._doubtful, *counts = get_counts(state, "counts", 6)
+        self._known, self._doubts, self._found = counts
+        # runs that were saved before pieces of map existed have none
+        self._joined, self._left = get_counts(state, "pieces", 2) if "pieces" in state else (0, 0)
         self._localisation = LocalisationState(min(localisation, LocalisationState.LOST))
         self._cause = "it was so when the mission was saved"
         self._steps.restore(select_prefix(state, "steps"))

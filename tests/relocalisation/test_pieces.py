@@ -114,3 +114,11 @@ def test_a_full_map_has_no_room_for_a_piece(camera: MapCamera) -> None:
     for frame in _frames(camera, HERE[:2]):
         TaskMapper(NoTaskEstimator(), mapper).process(frame)
     assert not Piece.fits(mapper)
+
+
+def test_a_run_that_was_saved_before_pieces_existed_is_resumed() -> None:
+    saved = FrameMonitor().state()
+    del saved["pieces"]
+    monitor = FrameMonitor()
+    monitor.restore(saved)
+    assert monitor.state()["pieces"].tolist() == [0, 0]
