@@ -148,7 +148,10 @@ class LightObjects:
 
     def restore(self, state: State) -> None:
         """Replace what is remembered and said. Raises MapFileError, InvalidInputError."""
-        edits, areas = (get_array(state, name, (None,), np.uint8).tobytes() for name in ("edits", "areas"))
+        # runs that were saved before an agent had edits and areas have none
+        edits, areas = (
+            get_array(state, name, (None,), np.uint8).tobytes() if name in state else b"" for name in ("edits", "areas")
+        )
         try:
             self.edits, self.areas = decode_edits(edits), decode_areas(areas)
         except CodecError as error:

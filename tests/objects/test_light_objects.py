@@ -69,6 +69,10 @@ def test_it_is_remembered_over_tasks_and_restarts_and_not_in_another_scene() -> 
     restarted = factory().build(MUG)
     restarted.restore(state)
     assert restarted.objects == first.objects
+    saved_without_edits = {name: value for name, value in state.items() if name not in ("light/edits", "light/areas")}
+    restarted = factory().build(MUG)
+    restarted.restore(saved_without_edits)
+    assert restarted.objects == first.objects
     saved_without_memory = {name: value for name, value in state.items() if not name.startswith("light/")}
     restarted = factory().build(MUG)
     restarted.restore(saved_without_memory)
