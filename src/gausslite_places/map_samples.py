@@ -98,4 +98,4 @@ def thinned_samples(team: TeamView, agent_id: str, alignment: FrameAlignment, gr
 
 def _present(voxels: ndarray) -> Bool[ndarray, "v s"]:
     """Return which samples the voxels have."""
-    return np.logical_not(np.isnan(voxels["samples"][:, :, 3]))
+    return np.asarray(~np.isnan(voxels["samples"][:, :, 3]), np.bool_)
