@@ -81,6 +81,11 @@ def is_stored(outcome: pb.SubsetOutcome) -> bool:
     return outcome.status in (pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE)
 
 
+def update_request(session_id: str, sequence: int, subset: bytes) -> pb.ContributeSubsetsRequest:
+    """Return the message that sends an encoded subset."""
+    return pb.ContributeSubsetsRequest(session_id=session_id, sequence=sequence, subset=subset)
+
+
 class UpdateStream:
     """One agent's stream. The methods raise grpc.aio.AioRpcError if the server ends it."""
 
@@ -93,7 +98,7 @@ class UpdateStream:
     async def send(self, subset: bytes) -> None:
         """Send an encoded subset and wait for its acknowledgement. Raises CodecError if it is not accepted."""
         self._sequence += 1
-        await self._call.write(self._request(subset, self._sequence))
+        await self._call.write(update_request(self._session_id, self._sequence, subset))
         response = await self._call.read()
         if not isinstance(response, pb.ContributeSubsetsResponse):
             raise CodecError(f"subset {self._sequence}: expected an acknowledgement, got the end of the stream")
@@ -110,13 +115,10 @@ class UpdateStream:
         async def requests() -> AsyncIterator[pb.ContributeSubsetsRequest]:
             while True:
                 self._sequence += 1
-                yield self._request(subset, self._sequence)
+                yield update_request(self._session_id, self._sequence, subset)
 
         async for _ in self._stub.ContributeSubsets(requests()):
             pass
-
-    def _request(self, subset: bytes, sequence: int) -> pb.ContributeSubsetsRequest:
-        return pb.ContributeSubsetsRequest(session_id=self._session_id, sequence=sequence, subset=subset)
 
 
 def send_all(address: str, session_id: str, subsets: Iterable[bytes]) -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from threading import Lock
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
+from gausslite.domain.pose import transform_points
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.alignment import FrameDecisions, TeamView
 from gausslite.fusion.epochs import agent_of, is_former
@@ -50,20 +52,29 @@ class _News:
 
 @dataclass(slots=True)
 class _AgentMap:
-    """What is known of one agent's map, and the voxels that have to be read again.
+    """What is known of one agent's map, and the sampled voxels that have to be read again: COMPARED_BYTES of each.
 
     frame_id: of the frame that `changed` and the comparisons are for, 0 before the first poll. compared: number of the
     latest comparison, 0 before the first. first_seq: of the updates since the last correction. is_new: some have come
     since the latest comparison.
     """
 
+    samples: MapSamples
     frame_id: int = 0
     unread: Int64[ndarray, " _"] = field(default_factory=lambda: _NO_KEYS)
     changed: int = 0
     is_new: bool = False
     compared: int = 0
     first_seq: int = 0
-    samples: MapSamples = field(default_factory=MapSamples)
+
+    @property
+    def keys(self) -> Int64[ndarray, " s"]:
+        """The sampled voxels, read or not."""
+        return np.union1d(self.samples.keys, self.unread)
+
+    def note(self, keys: Int64[ndarray, " k"]) -> None:
+        """Read these voxels again, as far as they are sampled."""
+        self.unread = self.samples.select(np.union1d(self.unread, keys))
 
 
 class _Frames(dict[str, FrameAlignment]):
@@ -92,7 +103,7 @@ class MapAligner:
         self._news: dict[str, _News] = {}
         self._maps: dict[str, _AgentMap] = {}
         self._comparisons: dict[frozenset[str], Comparison] = {}
-        self._unknown_frames = UnknownFrames(find)
+        self._unknown_frames = UnknownFrames(find, grid)
         self._compared = 0
         self._is_undecided = True
 
@@ -139,7 +150,7 @@ class MapAligner:
             if own.is_deleted:
                 self._delete(agent_id)
             if own.keys and agent_id in self._maps:
-                self._maps[agent_id].unread = np.unique(np.concatenate([self._maps[agent_id].unread, *own.keys]))
+                self._maps[agent_id].note(np.unique(np.concatenate(own.keys)))
                 self._maps[agent_id].changed += own.changed
                 self._maps[agent_id].is_new = True
         stored = team.store.agents()
@@ -154,8 +165,9 @@ class MapAligner:
 
     def _add(self, agent_id: str, team: TeamView) -> None:
         """Add a map that is new here, or under its name."""
-        unread = team.store.keys(agent_id)
-        own = self._maps[agent_id] = _AgentMap(unread=unread, changed=len(unread), is_new=True)
+        keys = team.store.keys(agent_id)
+        own = self._maps[agent_id] = _AgentMap(MapSamples(self._grid), changed=len(keys), is_new=True)
+        own.note(keys)
         if agent_id in team.frames and team.frames[agent_id][1].segments:
             own.first_seq = team.store.totals(agent_id).highest_update_seq + 1
 
@@ -173,7 +185,7 @@ class MapAligner:
         own = self._maps.get(agent_id)
         if own is not None:
             own.first_seq = alignment.segments[-1].first_seq if alignment.segments else 0
-            own.changed = max(own.changed, len(own.samples))
+            own.changed = max(own.changed, len(own.keys))
 
     def _drop_comparisons(self, agent_id: str) -> None:
         self._comparisons = {pair: found for pair, found in self._comparisons.items() if agent_id not in pair}
@@ -200,8 +212,7 @@ class MapAligner:
         highest_seq = team.store.totals(agent_id).highest_update_seq
         changed, own.changed = own.changed, 0
         try:
-            self._read(agent_id, team)
-            source = own.samples.in_frame(alignment, own.first_seq)
+            source = self._read(agent_id, team, alignment, own.first_seq)
             if len(source) < MIN_SAMPLES:
                 return
             witnesses = list(self._witnesses(agent_id, source, team, frames))
@@ -218,27 +229,26 @@ class MapAligner:
                 alignment = corrected(alignment, joint, first_seq, leaders)
             frames.decide(agent_id, replace(alignment, fit=joint))
 
-    def _read(self, agent_id: str, team: TeamView) -> None:
-        """Read the voxels that changed since the last time, as far as they are sampled."""
+    def _read(self, agent_id: str, team: TeamView, alignment: FrameAlignment, first_seq: int = 0) -> SurfaceSamples:
+        """Read the sampled voxels that changed since the last time; returns the samples as MapSamples.in_frame."""
         own = self._maps[agent_id]
-        own.samples.read(team, agent_id, own.samples.select(own.unread, self._grid))
+        own.samples.read(team, agent_id, own.unread)
         own.unread = _NO_KEYS
+        return own.samples.in_frame(alignment, first_seq)
 
     def _witnesses(self, agent_id: str, source: SurfaceSamples, team: TeamView, frames: _Frames) -> Iterator[_Witness]:
-        """Yield the agents to compare with: those that share most with it, and those that it contradicts."""
+        """Yield the agents to compare with: those compared before first, then those that share most with it."""
         places = np.unique(_PLACE_GRID.keys(source.points_m.astype(np.float32)))
         found = []
         for name, own in self._maps.items():
             if name == agent_id or name not in frames or not frames[name].is_localised:
                 continue
-            self._read(name, team)
-            samples = own.samples.in_frame(frames[name])
-            shared = int(np.isin(places, _PLACE_GRID.keys(samples.points_m.astype(np.float32))).sum())
-            if shared:
-                is_doubted = frozenset((agent_id, name)) in self._comparisons
-                found.append((not is_doubted, -shared, name, samples))
-        for _, _, name, samples in sorted(found, key=lambda candidate: candidate[:3])[:_MAX_WITNESSES]:
-            yield name, samples
+            centres_m = transform_points(frames[name].T_fused_agent, self._grid.centres_m(own.keys).astype(np.float64))
+            if shared := _shared(places, centres_m):
+                found.append((frozenset((agent_id, name)) not in self._comparisons, -shared, name))
+        # few are read, as all maps together change as fast as the team sends; what is unread may be tombstones
+        read = ((name, self._read(name, team, frames[name])) for _, _, name in sorted(found))
+        yield from islice((own for own in read if _shared(places, own[1].points_m)), _MAX_WITNESSES)
 
     def _leaders(self, agent_id: str, witnesses: Sequence[str], frames: _Frames) -> tuple[str, ...]:
         """Return the witnesses to whose frame the agent is corrected: used, not contradicted, and leading it."""
@@ -368,6 +378,11 @@ class MapAligner:
             and name in majority.supporters
             and (comparison.contradicting or (corrects(comparison.fit) and majority.is_even(agent_id, name)))
         }
+
+
+def _shared(places: Int64[ndarray, " p"], points_m: Float64[ndarray, "n 3"]) -> int:
+    """Return how many of these places have one of the points."""
+    return int(np.isin(places, _PLACE_GRID.keys(points_m.astype(np.float32))).sum())
 
 
 def _counted(before: Mapping[str, int], members: Collection[str], is_new: bool) -> dict[str, int]:

@@ -19,7 +19,7 @@ from gausslite.fusion.frames import FrameFit, Misfit
 from gausslite_places.surface_registration import Surface
 
 MIN_SAMPLES = 60
-_SAMPLES_PER_VOXEL = 3
+SAMPLES_PER_VOXEL = 3
 _MIN_OPACITY = 0.3
 LUMINANCE = np.array([0.299, 0.587, 0.114])
 _REACH_M = (0.15, 0.5, 1.0)
@@ -81,7 +81,7 @@ def opaque_rows(batch: VoxelBatch) -> Int64[ndarray, " n"]:
     """Return the three most opaque Gaussians of each voxel, without transparent ones."""
     voxel = np.repeat(np.arange(len(batch)), batch.counts)
     order = np.lexsort((-batch.gaussians.opacities, voxel))
-    rows = order[gather_rows(batch.offsets[:-1], np.minimum(batch.counts, _SAMPLES_PER_VOXEL))]
+    rows = order[gather_rows(batch.offsets[:-1], np.minimum(batch.counts, SAMPLES_PER_VOXEL))]
     chosen: Int64[ndarray, " n"] = rows[batch.gaussians.opacities[rows] >= _MIN_OPACITY]
     return chosen
 

@@ -247,8 +247,8 @@ def _one_of_each_cube(samples: SurfaceSamples) -> SurfaceSamples:
 class UnknownFrames:
     """Searches the frames of unlocalised agents as their maps and the team's grow. Call `search` from one thread."""
 
-    def __init__(self, find: Find) -> None:
-        self._find = find
+    def __init__(self, find: Find, grid: VoxelGrid) -> None:
+        self._find, self._grid = find, grid
         self.is_due = False
         """Whether more agents wait for a search."""
         # the team at the latest search, the agent's size and the team's
@@ -328,7 +328,7 @@ class UnknownFrames:
                     samples[ids[index]] = keyframe_samples(found.frame)
         self._samples_of_keyframe[agent_id] = samples
         seen = _one_of_each_cube(SurfaceSamples.concatenate([*samples.values()])).moved(alignment.T_fused_agent)
-        return SurfaceSamples.concatenate([thinned_samples(team, agent_id, alignment), seen])
+        return SurfaceSamples.concatenate([thinned_samples(team, agent_id, alignment, self._grid), seen])
 
 
 def _size(team: TeamView, agent_id: str) -> int:

@@ -7,6 +7,8 @@ from unittest.mock import patch
 import pytest
 
 from gausslite.cli.main import main
+from gausslite_bench.server.bench import ServerBenchSettings, run_server
+from gausslite_bench.server.stages import stages_ms
 from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
 
@@ -23,6 +25,7 @@ def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.
     assert all((load["missing"], load["refused"]) == (0, 0) for load in result["loads"])
     assert result["held"] == 20000
     assert min(result[name] for name in ("snapshot_s", "status_ms", "restart_s", "rss_mib")) > 0
+    assert [stages["agents"] for stages in report["stages_ms"]] == [2, 3]
 
 
 @pytest.mark.slow
@@ -36,6 +39,17 @@ def test_good_agents_are_measured_beside_an_attack(capsys: pytest.CaptureFixture
         for load in (result["quiet"], result["attacked"]):
             assert (load["messages"], load["missing"]) == (messages[result["attack"]], 0)
         assert result["rss_mib"] > 0
+
+
+def test_a_message_is_split_into_its_stages() -> None:
+    assert set(stages_ms(2)) == {"decode", "check", "store", "vote", "acknowledge"}
+
+
+def test_a_team_above_the_default_quota_has_room() -> None:
+    stopped = patch("gausslite_bench.service_process.subprocess.Popen", side_effect=KeyboardInterrupt)
+    with stopped as started, pytest.raises(KeyboardInterrupt):
+        run_server(ServerBenchSettings(agents=(24, 96)))
+    assert "quota-agents=96" in started.call_args.args[0]
 
 
 def test_a_service_is_started_without_options_of_the_benchmark(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Frames of a team: a misfit is measured and corrected, a gross one that others repeat is quarantined."""
 
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameFit
 from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig
+from gausslite.fusion.score_index import COMPARED_BYTES, COMPARED_VOXELS
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite_places.frame_aligner import MapAligner
@@ -444,3 +446,17 @@ def test_an_earlier_map_in_another_frame_is_corrected_or_deleted(shift_m: float,
     assert status["ant"].alignment.state is not AlignmentState.QUARANTINED
     if not is_kept:
         assert status["ant"].won_voxels == status["ant"].voxels > 0
+
+
+def test_what_a_comparison_keeps_of_a_map_is_in_the_memory_that_its_agent_may_take() -> None:
+    engine = aligning(fit=lambda *_: None)
+    floor = np.stack(np.meshgrid(np.arange(100), np.arange(100), range(3)), -1).reshape(-1, 3) * (0.1, 0.1, 0.02)
+    for agent_id in ("ant", "bee"):
+        send(engine, agent_id, plain_gaussians(floor + 0.01))
+    tracemalloc.start()
+    engine.align_due()
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert len(engine._aligner._maps["bee"].keys) > COMPARED_VOXELS / 2
+    # beside what is kept of the two agents
+    assert kept < 2 * COMPARED_VOXELS * COMPARED_BYTES + 100_000

@@ -14,7 +14,7 @@ from gausslite.codec.columns import (
     _unshuffle,
     quat_steps,
 )
-from gausslite.codec.encoded_voxels import CODES, MAX_TARGET, OPACITY_BITS, TARGET_BITS, voxel_table
+from gausslite.codec.encoded_voxels import CODES, OPACITY_BITS, TARGET_BITS, voxel_table
 from gausslite.domain.errors import CodecError
 
 
@@ -42,7 +42,7 @@ def reference_unpack(
     gaussians["fractions"] = (2 * cells + 1) << (MAX_FINE_BITS - bits)[:, None]
     gaussians["scales"], gaussians["quats"], gaussians["rgb"], gaussians["kappa"] = scales, quats, rgb, kappa
     gaussians["largest_and_opacity"] = largest << OPACITY_BITS | rest[3]
-    label = np.clip(target, -1, MAX_TARGET) + 1
+    label = np.clip(target, -1, (1 << TARGET_BITS) - 2) + 1
     gaussians["active_and_target"] = active.astype(np.uint8) << TARGET_BITS | label.astype(np.uint8)
     stated = of_voxels if adds_stated else [of_voxels[0], np.zeros_like(of_voxels[1])]
     table = voxel_table(keys, update_seq, decode_kappa_sums(stated, kappa, offsets), raw[2])

@@ -157,8 +157,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         align, notify = functools.partial(engine.align_due, 1), self._map_changes.notify
         self._aligning = BackgroundWork(align, notify, "frames are not compared", _ALIGN_DELAY_S)
         self._slices = BackgroundWork(engine.work_in_background, notify, "maps are not moved or deleted", 0.0)
-        self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
-        self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
         self._rejections = RejectionLog(_log)
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions

@@ -52,7 +52,6 @@ CODES = np.dtype(
 """21 bytes per Gaussian, without padding. Two bits for a quaternion's largest component, six for the opacity; one bit
 for `active`, seven for the target plus one."""
 OPACITY_BITS, TARGET_BITS = 6, 7
-MAX_TARGET = (1 << TARGET_BITS) - 2
 VOXELS = np.dtype([("keys", "<i8"), ("update_seqs", "<u8"), ("kappa_sums", "<u8"), ("counts", "<u4")])
 _HEAD = struct.Struct("<dI")
 

@@ -234,8 +234,7 @@ class FusionEngine:
         if needed <= limit:
             return
         name = quote_name(subset.agent_id)
-        former = self._former(subset.agent_id)
-        if former:
+        if former := self._former(subset.agent_id):
             self._release(min(former, key=self.maps.won_voxels))  # the one that the fused map misses least
             raise UnavailableError(f"agent {name}: a former map is being deleted to make room; try again in a moment")
         raise QuotaError(
@@ -319,14 +318,11 @@ class FusionEngine:
     def _within_memory(self, name: str, alignment: FrameAlignment) -> FrameAlignment:
         """Return an alignment; quarantined, if the map would take more than its agent may in that frame."""
         needed = self.store.memory_bytes(agent_of(name), _NO_KEYS) + MOVED_BYTES * self.store.totals(name).voxels
-        if alignment.is_identity or not alignment.is_used or needed <= self.settings.agent_bytes:
+        limit = self.settings.agent_bytes
+        if alignment.is_identity or not alignment.is_used or needed <= limit:
             return alignment
-        message = (
-            f"frame: expected a map that fits {self.settings.agent_bytes >> 10} KiB when it is moved, got a larger one"
-        )
-        return replace(
-            alignment, state=AlignmentState.QUARANTINED, message=f"{message} (memory-mb divided by quota-agents)"
-        )
+        message = f"frame: expected a moved map within {limit} bytes (memory-mb divided by quota-agents), got {needed}"
+        return replace(alignment, state=AlignmentState.QUARANTINED, message=message)
 
     def _begin_moves(self) -> None:
         for name in sorted(self.frames.unmoved):

@@ -82,6 +82,12 @@ class PackedTable:
             _raw(found)[here] = _raw(elements).take(at)
         return found
 
+    def parts(self, places: Int64[ndarray, " n"] | None) -> Sequence[_Run]:
+        """Return the elements at these places, or all, in parts; absent ones may be among them."""
+        if places is None:
+            return self._runs
+        return [(own[at], elements.take(at)) for own, elements, _, at in self._find(places)]
+
     def put(self, places: Int64[ndarray, " n"], elements: Table) -> Table:
         """Replace the elements at these places, all different, and return those before; absent ones leave the table."""
         is_new, before = self.is_present(elements), np.full(len(places), self._absent)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64, UInt64
+from jaxtyping import Bool, Int32, Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -28,9 +28,10 @@ Scores = NDArray[Any]
 
 update_seq and row are -1 where the agent has no update of a voxel.
 """
-NO_SCORES: Scores = np.zeros(0, SCORES)
 VOXEL_BYTES, TILE_BYTES = 65, 400
 """What a voxel, and each map's tile with voxels, take in memory here and in the change log; measured."""
+COMPARED_VOXELS, COMPARED_BYTES = 4096, 48
+"""Of how many voxels of a map a FrameAligner may keep something, and how much of each."""
 MORE_ROWS_BYTES, ROW_BYTES = 200, 9
 """What the rows of a tile beside the first take, together and each."""
 _LEAST_SIZE = 16
@@ -83,14 +84,10 @@ class AgentTotals:
             self.voxels + len(added) - int(np.count_nonzero(removed["update_seqs"] >= 0)),
             self.occupied_voxels + int(np.count_nonzero(counts)) - int(np.count_nonzero(counts_before)),
             self.gaussians + int(counts.sum(dtype=np.int64)) - int(counts_before.sum(dtype=np.int64)),
-            self.kappa_sum + _exact_sum(added["kappa_sums"]) - _exact_sum(removed["kappa_sums"]),
+            # Python's integers cannot wrap around
+            self.kappa_sum + sum(added["kappa_sums"].tolist()) - sum(removed["kappa_sums"].tolist()),
             max(self.highest_update_seq, int(added["update_seqs"].max(initial=0))),
         )
-
-
-def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
-    """Return a sum that cannot wrap around."""
-    return sum(values.tolist())
 
 
 class _Map:
@@ -108,8 +105,9 @@ class _Map:
 
     @property
     def memory_bytes(self) -> int:
-        """What it takes here and in the change log."""
+        """What it takes here, in the change log and in an aligner."""
         tables = VOXEL_BYTES * len(self.voxels) + TILE_BYTES * len(self.tiles)
+        tables += COMPARED_BYTES * min(len(self.voxels), COMPARED_VOXELS)
         return tables + MORE_ROWS_BYTES * len(self.more_rows) + ROW_BYTES * self.added_rows
 
 
@@ -134,11 +132,11 @@ class ScoreIndex:
         return self._map(name).totals
 
     def memory_bytes(self, names: Iterable[str], name: str, added: Int64[ndarray, " k"]) -> int:
-        """Return the memory that these maps take in the index and the change log, with voxels added to one, at most."""
+        """Return the memory that these maps take, see _Map, with voxels added to one, at most."""
         added_tiles = self._map(name).tiles.get(np.unique(tiles_at(places_of(added))))
         tiles = int(np.count_nonzero(added_tiles["written"] == 0))
         before = sum(self._maps[own].memory_bytes for own in names)
-        return before + VOXEL_BYTES * len(added) + TILE_BYTES * tiles
+        return before + (VOXEL_BYTES + COMPARED_BYTES) * len(added) + TILE_BYTES * tiles
 
     def digests(self, name: str) -> TileDigests:
         """Return the digests of a map's rows, which are kept with each change; empty for an unknown one."""
@@ -156,21 +154,13 @@ class ScoreIndex:
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return the totals of all maps on these voxels, or on all."""
         keys = None if keys is None else np.unique(keys)
-        found = {name: self.sorted_scores(name, keys) for name in self._near(keys)}
-        counts = [len(found.get(name, ())) for name in self.agents]
-        agent_index = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        return VoxelScoreTable(self.agents, agent_index, join_elements([NO_SCORES, *found.values()]))
+        near = self._near(keys)
+        maps = [(number, self._maps[name]) for number, name in enumerate(self.agents) if self._maps[name] in near]
+        return VoxelScoreTable(self.agents, *_sorted_scores(maps, keys))
 
     def sorted_scores(self, name: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
-        """Return the map's totals on those of these voxels (ascending keys) that it has, or on all."""
-        voxels = self._map(name).voxels
-        if keys is None:
-            places, found = voxels.select()
-            scores = _scores(keys_of(places), found)
-            return scores.take(np.argsort(scores["keys"]))
-        found = voxels.get(places_of(keys))
-        present = np.flatnonzero(found["rows"] >= 0)
-        return _scores(keys[present], found.take(present))
+        """Return the map's totals on those of these voxels, all different, that it has, or on all; keys ascend."""
+        return _sorted_scores([(0, self._map(name))], keys)[1]
 
     def put(self, name: str, scores: Scores) -> None:
         """Replace the map's totals on the voxels of the scores; `add_rows` came before."""
@@ -267,19 +257,30 @@ class ScoreIndex:
             self.agents = tuple(sorted(self._maps))
         return np.sort(keys_of(places))
 
-    def _near(self, keys: Int64[ndarray, " k"] | None) -> Sequence[str]:
-        """Return the names of the maps with voxels in the tiles of these ones, sorted; of all for None."""
+    def _near(self, keys: Int64[ndarray, " k"] | None) -> set[_Map]:
+        """Return the maps with voxels in the tiles of these ones; all for None."""
         if keys is None:
-            return self.agents
+            return set(self._maps.values())
         tiles = np.unique(tiles_at(places_of(keys))).tolist()
-        near = set[_Map]().union(*(self._at.get(tile, ()) for tile in tiles))
-        return [name for name in self.agents if self._maps[name] in near]
+        return set[_Map]().union(*(self._at.get(tile, ()) for tile in tiles))
 
     def rename(self, name: str, other: str) -> None:
         """Give a map another name, if it exists."""
         if name in self._maps:
             self._maps[other] = self._maps.pop(name)
             self.agents = tuple(sorted(self._maps))
+
+
+def _sorted_scores(maps: Sequence[tuple[int, _Map]], keys: Int64[ndarray, " k"] | None) -> tuple[ndarray, Scores]:
+    """Return the totals of numbered maps on these voxels, or on all, with their numbers; sorted by number and key."""
+    places = None if keys is None else places_of(keys)
+    parts = [(number, *part) for number, own in maps for part in own.voxels.parts(places)]
+    numbers = np.repeat(np.array([part[0] for part in parts], np.int32), [len(part[1]) for part in parts])
+    found = np.concatenate([np.zeros(0, np.int64), *(part[1] for part in parts)])
+    scores = _scores(keys_of(found), join_elements([np.zeros(0, _PACKED), *(part[2] for part in parts)]))
+    order = np.lexsort((scores["keys"], numbers))
+    order = order[scores["rows"][order] >= 0]
+    return numbers[order], scores.take(order)
 
 
 def _scores(keys: Int64[ndarray, " k"], packed: Table) -> Scores:

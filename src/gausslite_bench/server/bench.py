@@ -17,11 +17,13 @@ from statistics import median
 from gausslite.cli.progress import progress_bar
 from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
+from gausslite.fusion.limits import Quotas
 from gausslite.wire.clients import FusionClient
 from gausslite_bench.cli.study_options import names_among
 from gausslite_bench.report import Report
 from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult
 from gausslite_bench.server.hostile import ATTACKS, measure_attack
+from gausslite_bench.server.stages import stages_ms
 from gausslite_bench.server.synthetic_updates import GAUSSIANS_PER_VOXEL
 from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
@@ -73,7 +75,8 @@ def run_server(settings: ServerBenchSettings) -> Report:
             with _new_server(settings) as server:
                 results.append(_measure(settings, held, server, progress.set_description))
             progress.update()
-    return Report({"server": settings.server, "servers": results})
+    stages = [{"agents": agents, **stages_ms(agents)} for agents in settings.agents]
+    return Report({"server": settings.server, "servers": results, "stages_ms": stages})
 
 
 @contextmanager
@@ -82,6 +85,8 @@ def _new_server(settings: ServerBenchSettings, service: str = "FusionService") -
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         command, address = f"{settings.server} --store {folder}/store.sqlite", ""
+        if max(settings.agents) > Quotas().agents and "quota-agents" not in command:
+            command += f" --set quota-agents={max(settings.agents)}"
         if service != "FusionService":
             # an agent without a task's relevance needs no detector
             command = f"{shlex.quote(sys.executable)} -m {_OTHERS[service]}"

@@ -21,7 +21,8 @@ DELTA_VOXELS = 30
 _PATCH_COLUMNS = np.array([6, 5])
 _PATCHES_IN_ROW = 64
 _FILL_VOXELS = 500
-_PATCHES = 8
+PATCHES = 8
+"""Of an agent; each of its messages is one of them."""
 _NOISE_M, _COLOUR_NOISE = 0.001, 0.03
 
 
@@ -60,13 +61,13 @@ def fill_messages(agent_id: str, first: int, voxels: int) -> Iterator[bytes]:
 
 def delta_messages(agent_id: str, number: int, count: int, first_seq: int) -> list[bytes]:
     """Return encoded updates of the agent's area; half of it is shared with the next agent."""
-    area = number * _PATCHES // 2 * DELTA_VOXELS
+    area = number * PATCHES // 2 * DELTA_VOXELS
     batches = [
         voxels_batch(range(start, start + DELTA_VOXELS), number * 100 + patch)
-        for patch, start in enumerate(range(area, area + _PATCHES * DELTA_VOXELS, DELTA_VOXELS))
+        for patch, start in enumerate(range(area, area + PATCHES * DELTA_VOXELS, DELTA_VOXELS))
     ]
     return [
-        encode_subset(RoiSubset(agent_id, "", seq, seq, batches[seq % _PATCHES]), GRID)
+        encode_subset(RoiSubset(agent_id, "", seq, seq, batches[seq % PATCHES]), GRID)
         for seq in range(first_seq, first_seq + count)
     ]
 

@@ -150,9 +150,9 @@ def test_former_maps_are_few_and_leave_in_slices(open_store: OpenStore) -> None:
 
 
 def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = engine_on(memory_bytes=64 * 5_000)
+    engine = engine_on(memory_bytes=64 * 7_500)
     send(engine, reboot(engine), 1, {cell: [9] for cell in range(50)})
-    with pytest.raises(QuotaError, match=r"at most 5000 bytes of memory \(memory-mb divided by quota-agents\)"):
+    with pytest.raises(QuotaError, match=r"at most 7500 bytes of memory \(memory-mb divided by quota-agents\)"):
         send(engine, reboot(engine, "bee"), 1, {cell: [9] for cell in range(300)}, "bee")
     session = reboot(engine)
     # the former map makes room
@@ -163,7 +163,7 @@ def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPat
     assert fused_kappas(engine) == dict.fromkeys(range(50, 100), 1)
     # voxels in another frame take more, where they lie and where they came from
     away = transform_of(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(QuotaError, match="a map that fits 4 KiB when it is moved"):
+    with pytest.raises(QuotaError, match="a moved map within 7500 bytes"):
         engine.declare_frame("ant", away)
     assert fused_kappas(engine) == dict.fromkeys(range(50, 100), 1)
     engine._aligner = Mock()
@@ -174,11 +174,11 @@ def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPat
         assert engine.align_due()
         assert engine.frames.get("ant").state is AlignmentState.QUARANTINED
     assert fused_kappas(engine) == {}
-    small = engine_on(memory_bytes=64 * 5_000)
+    small = engine_on(memory_bytes=64 * 7_500)
     session = reboot(small, "cat")
     small.declare_frame("cat", away)
     send(small, session, 1, {key: [2] for key in range(30)}, "cat")
-    with pytest.raises(QuotaError, match="at most 5000 bytes"):
+    with pytest.raises(QuotaError, match="at most 7500 bytes"):
         send(small, session, 2, {key: [2] for key in range(50, 60)}, "cat")
     monkeypatch.setattr("gausslite.fusion.limits._CONTAINER_LIMITS", ())
     assert FusionSettings(grid=GRID).agent_bytes > 1 << 20

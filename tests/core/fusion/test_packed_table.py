@@ -83,7 +83,7 @@ def test_a_message_asks_the_maps_that_have_its_voxels(seed: int) -> None:
         assert np.array_equal(asked.agent_index, expected.agent_index)
         assert np.array_equal(asked.scores, expected.scores)
     far = grid.keys(np.full((1, 3), 50.0, np.float32))
-    assert index._near(far) == []
+    assert index._near(far) == set()
     for name in index.agents:
         index.remove_from(name, index.last_tiles(name, 1 << 20)[0])
     # nothing is kept of maps that are gone

@@ -4,12 +4,14 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 from call_context import Context
 from fusion_running import GRID, keys, make_subset
 from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.codec.subset_codec import decode_subset
+from gausslite.domain.pose import transform_of
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
@@ -109,6 +111,23 @@ def test_watchers_that_follow_closely_share_each_step(monkeypatch: pytest.Monkey
     assert late.changes(before) == (revision, parts)
     assert late.changes(revision) == early.changes(revision)
     assert FusedMapLayers.changes.call_count == 2
+
+
+def test_work_in_the_background_wakes_the_watchers() -> None:
+    async def run() -> None:
+        engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID), first_revision=1)
+        servicer = FusionServicer(engine, RefineSettings(), ReferenceRasterizer)
+        session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
+        engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
+        responses = servicer.WatchFusedMap(pb.WatchFusedMapRequest(), Context("unix:"))
+        assert (await anext(responses)).block.snapshot
+        engine.declare_frame("ant", transform_of(np.array([1.0, 0, 0, 0, 0, 0])))
+        servicer._slices.wake()
+        assert not (await asyncio.wait_for(anext(responses), 10)).block.snapshot
+        await responses.aclose()
+        servicer.close()
+
+    asyncio.run(run())
 
 
 def test_watchers_wake_together_after_many_changes() -> None:

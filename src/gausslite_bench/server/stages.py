@@ -1,0 +1,76 @@
+"""Split the processor time of a message by stage: messages of a load, one after the other, in this process."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray
+
+from gausslite.codec.encoded_voxels import EncodedSubset
+from gausslite.codec.subset_codec import unpack_subset
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.update_log import PutOutcome
+from gausslite.fusion.updates import MissionClock, UpdateChecks
+from gausslite.wire.call_limits import RejectionLog
+from gausslite.wire.security import Caller
+from gausslite_bench.async_calls import update_request
+from gausslite_bench.server.synthetic_updates import GRID, PATCHES, delta_messages
+from gausslite_fusion_server.contributions import Acknowledger, StoredCount
+
+
+class _TimedStore(SqliteStore):
+    """Adds up the processor time of its transactions."""
+
+    cpu_s = 0.0
+
+    def put_all(self, updates: Sequence[EncodedSubset]) -> list[PutOutcome]:
+        begin_s = time.thread_time()
+        try:
+            return super().put_all(updates)
+        finally:
+            self.cpu_s += time.thread_time() - begin_s
+
+
+def stages_ms(agents: int) -> dict[str, float]:
+    """Return the processor time of a message in each stage; vote: with the layers of the map, and the queue.
+
+    Each message is committed alone, into a file, when all voxels of all agents are stored.
+    """
+    names = [f"load-{number}" for number in range(agents)]
+    messages = [delta_messages(name, number, 2 * PATCHES, 1) for number, name in enumerate(names)]
+    with tempfile.TemporaryDirectory() as folder, closing(_TimedStore(Path(folder) / "store.sqlite")) as store:
+        settings = FusionSettings(grid=GRID, quotas=Quotas(agents=agents))
+        engine, checks = FusionEngine(store, settings), UpdateChecks(store, settings.quotas, MissionClock(store))
+        stream = Acknowledger(Caller("unix"), engine.traffic, RejectionLog(logging.getLogger(__name__)))
+        sessions = [engine.join(name, MissionConfig("", "", GRID.size_m)).session for name in names]
+        times_s: list[ndarray] = []
+        for number, subsets in enumerate(zip(*messages, strict=True)):
+            if number == PATCHES:
+                store.cpu_s, times_s = 0.0, []
+            for session, data in zip(sessions, subsets, strict=True):
+                request = update_request(session.session_id, number, data)
+                sent, stamps_s = request.SerializeToString(), [time.thread_time()]
+                request = request.FromString(sent)
+                subset = unpack_subset(request.subset)[0]
+                stamps_s.append(time.thread_time())
+                checks.require_permitted(subset)
+                stamps_s.append(time.thread_time())
+                put = engine.enqueue_update(session, subset)
+                engine.commit_updates()
+                stored = put.result()
+                stamps_s.append(time.thread_time())
+                counts = StoredCount(len(stored.accepted), len(stored.stale))
+                stream.accept(request, session.agent_id, counts).SerializeToString()
+                times_s.append(np.diff([*stamps_s, time.thread_time()]))
+        decode, check, commit, acknowledge = (1000 * np.mean(times_s, axis=0)).tolist()
+        put_all = 1000 * store.cpu_s / len(times_s)
+    vote = commit - check - put_all
+    return {"decode": decode, "check": check, "store": put_all, "vote": vote, "acknowledge": acknowledge}
