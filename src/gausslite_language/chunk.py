@@ -187,8 +187,8 @@ def names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chun
     if of_follows and is_picture:
         return True
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
-    if compound and noun.head in lexicon.PLACES and not of_follows:
-        return True
+    if (compound or lexicon.COLOURS.intersection(noun.words)) and noun.head in lexicon.PLACES and not of_follows:
+        return True  # "on the yellow area"
     if noun.head in lexicon.PHYSICAL_MEASURES and verb in verbs.HANDLING_VERBS and pending is None and not of_follows:
         return True
     unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS

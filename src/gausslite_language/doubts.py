@@ -34,10 +34,9 @@ def lost_nouns(tagged: Sequence[tuple[str, Tag]], draft: GraphDraft) -> tuple[st
     """
     names = (*draft.targets, *draft.anchors, *draft.excluded, *draft.context, *draft.warnings)
     used = {singular(word.strip("'")) for name in names for word in name.split()} | _NO_OBJECTS
-    types, clause = clause_types(tagged), ClauseType.REQUEST
+    types, clause, is_definite = clause_types(tagged), ClauseType.REQUEST, False
     lost: dict[str, None] = {}
     padded = [("", None), ("", None), *tagged, ("", None), ("", None)]
-    is_definite = False
     for index, (word, tag) in enumerate(tagged):
         clause = types.get(index, clause)
         before, next_tag = padded[index + 1][1], padded[index + 3][1]

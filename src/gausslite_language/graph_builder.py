@@ -228,8 +228,7 @@ class GraphBuilder:
                 self._assigner.assign_by_preposition(pending, phrase_from_text(phrase))
 
     def _deny_reference(self, pending: str | None) -> None:
-        clause = self._clause
-        named = (clause.objects or clause.referents)[-1:]
+        named = (self._clause.objects or self._clause.referents)[-1:]
         if pending is not None and named:
             self._place_negated(phrase_from_text(named[0]), pending)
 
@@ -340,6 +339,11 @@ class GraphBuilder:
         if pending is not None and self._clause.terms.negated and not of_follows:
             words = f"not {self._clause.preposition} {noun.text}"
             self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
+        is_located = after is not None and after.kind is ChunkKind.PREPOSITION
+        is_located = is_located and self._following[:2][-1].word not in lexicon.PLACES  # "into the spot behind the bin"
+        goes_there = pending in ("to", "on", "inside") and self._clause.verb in verbs.DELIVERY_VERBS
+        if goes_there and noun.has_determiner and noun.head in lexicon.PLACES and not is_located:
+            self._draft.warnings.append(f"{noun.text!r} is not part of the task")  # "drop them into the zone"
         self._clause.in_space = noun.head == "room"
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
@@ -371,10 +375,8 @@ class GraphBuilder:
 
     def _may_harm(self, pending: str | None) -> bool:
         """Return True for "don't touch", and for "don't go near" or "over", unlike "don't go to"."""
-        verb = self._clause.verb
-        return verb in verbs.CONTACT_VERBS or (
-            verb in verbs.GO_VERBS and pending in ("near", "on", "above", "past", "via")
-        )
+        goes_near = self._clause.verb in verbs.GO_VERBS and pending in ("near", "on", "above", "past", "via")
+        return goes_near or self._clause.verb in verbs.CONTACT_VERBS
 
     def _place_negated(self, noun: NounPhrase, relation: str) -> None:
         """Relate an obstacle to its place; "the mugs except the one on the shelf" negates the relation."""

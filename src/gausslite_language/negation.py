@@ -45,8 +45,8 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.close()  # "my son can't find his bear"
         if buffer.last_kind() is ChunkKind.NOUN:
             buffer.chunks.pop()
-    elif _opens_question(buffer):
-        buffer.close()  # "isn't there a mug on the table?"
+    elif _opens_question(buffer) or (buffer.word(-1), buffer.word(1)) == ("if", ","):
+        buffer.close()  # "isn't there a mug on the table?", "if not, wait for him"
     elif (word in _NOTS and _negates_place(buffer)) or (
         word in _NOTS and is_attribute(buffer.word(1)) and _follows_noun_of_state(buffer)
     ):

@@ -383,13 +383,11 @@ class RoleAssigner:
         clause = self.clause
         if clause.verb in verbs.TRAVEL_VERBS:
             self._make_places_targets(passes=True)  # "between the shelves to the exit"
-        if clause.route or not clause.objects or clause.verb in verbs.GO_VERBS - verbs.MOVING_VERBS:
+        leads, travels = clause.verb in verbs.LEADING_VERBS, clause.verb in verbs.GO_VERBS - verbs.MOVING_VERBS
+        if not clause.objects or (not leads and (clause.route or travels)):
             moving = {"turn"} | verbs.TRAVEL_VERBS | verbs.DELIVERY_VERBS | verbs.SPEAKING_VERBS
             going = clause.route or clause.verb is None or clause.verb in moving
             role = TargetRole.DESTINATION if going else TargetRole.OBJECT
-            if clause.verb in verbs.LEADING_VERBS and clause.objects:
-                self._add_destination(noun)
-                return
             self.target(noun, role, conjoined=bool(clause.objects))
             clause.route = False
         else:

@@ -116,7 +116,7 @@ _NEVER_NOUNS: Final = verbs.GO_VERBS | verbs.words("never_nouns")
 # at the start of a clause no things: "stand in front of", "swing left", "stock the shelf"
 _ENDS: Final = frozenset({Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
 _MODIFIERS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE, Tag.PARTICIPLE})
-_PLACES: Final = word_set("near on inside under above behind in_front_of")
+_PLACES: Final = word_set("near on inside under above behind in_front_of to")
 _INTERJECTIONS: Final = word_set("just please pls plz")
 _MOTIONS: Final = verbs.GO_VERBS | verbs.STOPPING_VERBS | word_set("turn pass")
 _ARTICLES: Final = frozenset({"a", "an", "the", "my", "your", "every"})
@@ -337,7 +337,7 @@ def _verb_options(before: str, word: str, is_noun: bool) -> Options:
         options[Tag.VERB] = 0 if usual else 5 if word in _USUALLY_VERBS else 12
         if _is_noun(before):  # "the cup bring": a singular noun is not the verb's subject
             options[Tag.VERB] += 8
-    elif verbs.base_of_s(word) is not None:
+    elif verbs.base_of_s(word) is not None and before != "to":  # "take it to returns"
         options[Tag.VERB] = 2 if not is_noun else 8 if verbs.base_of_s(word) in _USUALLY_VERBS else 18
     elif not is_noun and (word.endswith(_VERB_ENDINGS) or _prefixed(word)):
         options[Tag.VERB] = 5

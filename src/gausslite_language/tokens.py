@@ -250,7 +250,7 @@ _PLAIN: Final = {
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
     r"(?:stay|keep) out of": "avoid",
-    r"(?<!while),? avoiding": ", avoid",
+    r"(?: while)?,? avoiding": ", avoid",
     r"(?:try|take care|be careful|be sure|make sure) (?:to|you)(?= avoid)": "",
     r"give (.{2,60}?) a (?:wide )?berth": r"avoid \1",
     r"(?:stay|keep|remain) close to": "follow",

@@ -385,6 +385,9 @@ def test_what_is_typed_in_a_hurry_is_read_with_a_warning(text, same, warning):
         ("Which direction is the vase relative to me?", "Which direction is the vase from me?"),
         ("grab the cup no just the plate", "Grab the cup, no, the plate"),
         ("Collect tools, for example a hammer", "Collect tools, a hammer"),
+        ("Drive to the dock while avoiding people", "Drive to the dock, avoid people"),
+        ("Find the mug. If not, wait for the nurse", "Find the mug. Wait for the nurse"),
+        ("avoid the cat shes on the bed", "Avoid the cat, she is on the bed"),
     ],
 )
 def test_what_strangers_say_is_read_as_the_plain_sentence(text, same):
@@ -402,6 +405,8 @@ def test_what_strangers_say_is_read_as_the_plain_sentence(text, same):
         ("Robot, inspect the pipe for cracks", []),
         ("Fly over the building with a sign to the tower", ["sign"]),
         ("Drone, zorquil the window of the garage", ["zorquil"]),
+        ("Drop the parcels into the zone of the same colour", ["zone"]),
+        ("Set the crate in the spot behind the van", []),
         ("The baby sleeps, so close the curtains because guests are coming", []),
     ],
 )
@@ -444,6 +449,8 @@ def test_the_validator_refuses_relations_between_unknown_nouns():
         ("Find the van in visitor parking", ("van",), ("visitor parking",)),
         ("Tidy up: stack plates on the rack", ("plate", "rack"), ()),
         ("Find the vases please get the jug avoid glass", ("vase", "jug", "glass"), ()),
+        ("Drop the jug on the green area", ("jug", "area"), ()),
+        ("take a cart to receiving and a jug to returns", ("cart", "receiving", "jug", "return"), ()),
     ],
 )  # fmt: skip
 def test_what_the_robot_handles_is_an_object_and_where_it_is_an_anchor(text, targets, anchors):
