@@ -24,12 +24,13 @@ prepare_metadata_for_build_editable = build.prepare_metadata_for_build_editable
 build_sdist = build.build_sdist
 
 
-def _can_build_here() -> bool:
-    """True if this user can write the source's build folder and all in it."""
-    folder = Path("build")
-    if not folder.exists():
-        return os.access(".", os.W_OK)
-    return all(os.access(path, os.W_OK) for path in (folder, *folder.iterdir()))
+def _can_write(folder: Path) -> bool:
+    """True if this user can write the folder, which is created, and all in it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return all(os.access(path, os.W_OK) for path in (folder, *folder.iterdir()))
+    except OSError:
+        return False
 
 
 def _build(
@@ -39,17 +40,18 @@ def _build(
     metadata_directory: str | None = None,
 ) -> str:
     settings = dict(config_settings or {})
-    if "build-dir" in settings or _can_build_here():
+    if "build-dir" in settings or _can_write(Path("build")):
         return of_kind(wheel_directory, settings, metadata_directory)
     # CMake refuses the folder of a source at another place
     source = hashlib.sha256(os.fsencode(Path.cwd())).hexdigest()[:16]
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "gausslite" / source
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        with tempfile.TemporaryDirectory(prefix="gausslite-build-") as folder:
-            return of_kind(wheel_directory, {**settings, "build-dir": folder}, metadata_directory)
-    return of_kind(wheel_directory, {**settings, "build-dir": f"{cache}/{{wheel_tag}}"}, metadata_directory)
+    # Path.expanduser fails for a user without a home, as in a container
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    cache = Path(caches) / "gausslite" / source
+    # `sudo pip` may have left a folder of root
+    if _can_write(cache):
+        return of_kind(wheel_directory, {**settings, "build-dir": f"{cache}/{{wheel_tag}}"}, metadata_directory)
+    with tempfile.TemporaryDirectory(prefix="gausslite-build-") as folder:
+        return of_kind(wheel_directory, {**settings, "build-dir": folder}, metadata_directory)
 
 
 build_wheel = partial(_build, build.build_wheel)

@@ -22,7 +22,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.checks import describe, require_instance, require_size, require_types
-from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.lens import Lens, LensModel
@@ -178,12 +178,11 @@ def _plan(
     models = PerceptionSettings() if perception is None else perception
     require_instance("settings", mission, MissionSettings, "gausslite.MissionSettings(...)")
     require_instance("perception", models, PerceptionSettings, "gausslite.PerceptionSettings(...)")
+    chosen = _require_regions(regions)
     if task is not None:
         require_instance("task", task, str, "a sentence as text")
-    chosen = _require_regions(regions)
-    if task is not None and chosen:
-        raise InvalidInputError("task: expected either a task or regions, got both")
-    if task is not None:
+        if chosen:
+            raise InvalidInputError("task: expected either a task or regions, got both")
         return RunPlan(mission, models, schedule=TaskSchedule(DefaultParser().parse(task)))
     if models.model is not None:
         raise InvalidInputError("perception.model: expected a task for the detector, got none")
@@ -275,8 +274,10 @@ def render_view(
     uses all. Raises PoseError, ShapeError, KernelError.
     """
     require_types(gaussians=(gaussians, Gaussians), camera=(camera, Camera), backend=(backend, str))
-    require_types(T_world_camera=(T_world_camera, (ndarray, list, tuple)))
-    pose = np.asarray(T_world_camera, np.float64)
+    try:
+        pose = np.asarray(T_world_camera, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PoseError(f"T_world_camera: expected a 4x4 matrix of numbers, got others ({error})") from error
     require_rigid("T_world_camera", pose)
     image = view_map(gaussians, backend, threads).render(camera, pose)
     return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)

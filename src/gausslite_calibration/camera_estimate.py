@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy import ndarray
 
-from gausslite.datasets.source import Source, downscaled_size
+from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.recording import CameraCorrection
@@ -49,7 +49,7 @@ def estimate_camera(source: Source, known: CameraCorrection) -> CameraEstimate:
 
     A lens of `known` is kept. Frames that cannot be read are skipped. Depth must be registered to colour.
     """
-    moving = MovingPairs.read(source, downscaled_size(source.camera))
+    moving = MovingPairs.read(source, capped_size(source.camera))
     if len(moving.pairs) < _MIN_PAIRS:
         reason = f"{len(moving.pairs)} pairs of frames turn fast enough, expected at least {_MIN_PAIRS}"
         return CameraEstimate(known, (reason,))

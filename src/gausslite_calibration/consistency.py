@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.pose_track import pose_from_quaternion, quat_xyzw
-from gausslite.datasets.source import Source, downscaled_size
+from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory
@@ -330,7 +330,7 @@ def _rectified(source: Source) -> Source:
 
 def match_pair(images: Source, first: int, second: int) -> _Pair | None:
     """Return the pair of these positions; None without enough common points. Raises DatasetError, PoseError."""
-    size = downscaled_size(images.camera)
+    size = capped_size(images.camera)
     reference, current = images.frame(first, size), images.frame(second, size)
     matched = relative_pose(detect_features(reference), detect_features(current), reference.camera)
     return None if matched is None else _Pair(first, second, matched, reference.camera)

@@ -203,7 +203,7 @@ def _grid_coordinates(width: int, height: int) -> list[Float32[ndarray, "h w"]]:
     return list(np.meshgrid(*sides))
 
 
-_MAX_VELOCITY_CHANGE, _LEAST_GAP_S = 0.5, 1e-6
+_MAX_VELOCITY_CHANGE, _LEAST_GAP_S, _TYPICAL_DISTANCE_M = 0.5, 1e-6, 2.0
 
 
 def is_steady(trajectory: Trajectory, i: int) -> bool:
@@ -215,8 +215,13 @@ def is_steady(trajectory: Trajectory, i: int) -> bool:
         twist_of(inverse(T[k]) @ T[k + 1]) / max(float(times_s[k + 1] - times_s[k]), _LEAST_GAP_S) for k in (i - 1, i)
     )
     change, mean = after - before, 0.5 * (before + after)
-    limit = _MAX_VELOCITY_CHANGE * Twist(mean[:3], mean[3:]).typical_image_speed
-    return Twist(change[:3], change[3:]).typical_image_speed <= limit
+    limit = _MAX_VELOCITY_CHANGE * typical_image_speed(Twist(mean[:3], mean[3:]))
+    return typical_image_speed(Twist(change[:3], change[3:])) <= limit
+
+
+def typical_image_speed(twist: Twist) -> float:
+    """Return the image motion in focal lengths per second, of a point at a distance of 2 m."""
+    return float(np.linalg.norm(twist.angular_rad_s) + np.linalg.norm(twist.linear_m_s) / _TYPICAL_DISTANCE_M)
 
 
 _SPEED_QUANTILE = 0.9

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.datasets.source import Source, downscaled_size
+from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.camera import Camera, lift
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory, inverse
@@ -150,7 +150,7 @@ class _DepthPair:
 
 def _farthest_pairs(source: Source, trajectory: Trajectory) -> Iterator[_DepthPair]:
     """Yield pairs spread over the source, each as far apart as the frames show the same surfaces, else neighbours."""
-    count, size, gap = len(source), downscaled_size(source.camera), 2
+    count, size, gap = len(source), capped_size(source.camera), 2
     for first in sorted({round(position) for position in np.linspace(0, count - 1, _MAX_PAIRS)}):
         direction, gap = 1 if first < count // 2 else -1, max(min(2 * gap + 1, count // 2), 1)
         with suppress(DatasetError, PoseError):

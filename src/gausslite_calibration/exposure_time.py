@@ -21,7 +21,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, Twist, inverse
 from gausslite.domain.recording import CameraCorrection
-from gausslite_calibration.corrected import correct_frame, is_steady
+from gausslite_calibration.corrected import correct_frame, is_steady, typical_image_speed
 from gausslite_calibration.moving_pairs import warp_into
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4
@@ -85,7 +85,7 @@ def _speed_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
     """Return positions (slow, fast) of frames that show the same surfaces at different speeds, fastest first."""
     poses = trajectory.T_world_camera
     twists = [trajectory.twist(i) for i in range(len(poses))]
-    speeds = np.array([twist.typical_image_speed for twist in twists])
+    speeds = np.array([typical_image_speed(twist) for twist in twists])
     separation = max(1, len(speeds) // (4 * _MAX_PAIRS))
     pairs: list[tuple[int, int]] = []
     for fast in np.argsort(-speeds).tolist():

@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
-from gausslite.datasets.source import Source, downscaled_size
+from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis, rotation_angle_deg, translation_m
@@ -151,7 +151,7 @@ def _cause(note: str) -> str:
 def compared(frame: Frame) -> Frame:
     """Return the frame in the size that comparisons ask for."""
     image = RgbdImage(frame.rgb, frame.depth_m, frame.camera)
-    return replace(resize_rgbd(image, downscaled_size(frame.camera)).in_frame(frame), recorded_rgb=None)
+    return replace(resize_rgbd(image, capped_size(frame.camera)).in_frame(frame), recorded_rgb=None)
 
 
 def _is_later(last: Frame, frame: Frame) -> bool:

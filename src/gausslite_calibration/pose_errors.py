@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy import ndarray
 
-from gausslite.datasets.source import Source, downscaled_size
+from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, twist_of
@@ -68,7 +68,7 @@ def _std_per_view(pair_errors: ndarray) -> float:
 
 def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
     """Yield frames, each with another one warped into its view, spread over the source and far apart in time."""
-    count, size = len(source), downscaled_size(source.camera)
+    count, size = len(source), capped_size(source.camera)
     last_gap = count // 4
     for position in sorted({round(position) for position in np.linspace(0, count - 1, _MAX_PAIRS)}):
         direction = 1 if position < count // 2 else -1

@@ -23,7 +23,7 @@ COCO_NAMES: Final = tuple(" ".join(name.split()) for name in _COCO.split(","))
 _COCO_GAPS: Final = frozenset({12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
 _COCO_BY_ID: Final = dict(zip((i for i in range(1, 91) if i not in _COCO_GAPS), COCO_NAMES, strict=True))
 _KEYS: Final = ("names", "class_names", "classes", "labels")
-_INDEXED: Final = re.compile(r"(\d+)\s*[:=]\s*(.+)")
+_INDEXED: Final = re.compile(r"(\d+)\s*([:=,\s])\s*(.+)")
 _NOTES: Final = "rfdetr_notes"
 """The field in which `export(notes=...)` of rfdetr stores a text or JSON."""
 
@@ -49,10 +49,10 @@ def stated_names(path: Path, metadata: Mapping[str, str]) -> dict[int, str]:
     if not beside.is_file():
         return {}
     try:
-        lines = beside.read_text(encoding="utf-8-sig").splitlines()
+        text = beside.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ModelFileError(f"{beside}: expected one class name per line, but {error}") from error
-    return dict(enumerate(line.strip() for line in lines if line.strip()))
+    return _names_in(_parsed(text, one_per_line=True))
 
 
 def names_file(path: Path) -> Path:
@@ -83,8 +83,8 @@ def names_of(stated: Mapping[int, str], classes: int) -> tuple[str, ...]:
     return tuple(stated.get(index, "") for index in range(classes))
 
 
-def _parsed(text: str) -> Any:
-    """Return the value of JSON or of a Python literal; words separated by lines or commas, `0: mug` by its index."""
+def _parsed(text: str, one_per_line: bool = False) -> Any:
+    """Return the value of JSON or of a Python literal; else the words of lines or a list, numbered ones by index."""
     for parse in (json.loads, ast.literal_eval):
         try:
             return parse(text)
@@ -92,10 +92,19 @@ def _parsed(text: str) -> Any:
             continue
     if text.startswith(("{", "[", "(")):
         return None
-    words = text.splitlines() if "\n" in text else text.replace(";", ",").split(",")
+    words = text.splitlines() if one_per_line or "\n" in text else text.replace(";", ",").split(",")
     words = [word.strip() for word in words if word.strip()]
-    indexed = [_INDEXED.fullmatch(word) for word in words]
-    return {entry[1]: entry[2] for entry in indexed if entry} if all(indexed) else words
+    if words and words[0] in (f"{key}:" for key in _KEYS):  # YAML
+        words = words[1:]
+    if all(word.startswith("- ") for word in words):
+        words = [word[2:].strip() for word in words]
+    indexed = [entry for word in words if (entry := _INDEXED.fullmatch(word))]
+    names = {int(entry[1]): entry[3].strip("'\"") for entry in indexed}
+    # without a colon, the number may belong to the name: "5 cent coin"
+    first = min(names, default=0)
+    runs_on = first <= 1 and sorted(names) == list(range(first, first + len(words)))
+    is_numbered = runs_on or all(entry[2] in ":=" for entry in indexed)
+    return names if is_numbered and len(indexed) == len(words) else words
 
 
 def _names_in(value: Any) -> dict[int, str]:

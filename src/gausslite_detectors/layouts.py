@@ -135,6 +135,8 @@ def _reason(outputs: Outputs) -> tuple[str, str]:
     line = _YOLO_LINE if "ultralytics" in outputs.metadata.get("author", "").lower() else _FREE_LINE
     if len(shapes) >= 3 and all(len(shape) in (3, 4) for shape in shapes):
         return "the feature maps of a network without its last layers", line
+    if shapes == [(7,)] and count != 7:
+        return "one list of boxes for all images of a batch, as YOLOv7's end2end has it", "export it without end2end"
     if all(len(shape) == 1 for shape in shapes):
         return "one list of numbers per image, as networks that classify whole images have", line
     if any(len(shape) == 2 and shape[1] == 5 for shape in shapes) and outputs.named("dets"):

@@ -35,7 +35,6 @@ from gausslite_view.pointing import PointingPanel
 _INTERVAL_S = 1.0
 _MOST_SHARE = 0.2
 """Of the mission's time that drawing takes at most."""
-_NS_PER_S = 1e9
 _PREPARING = "The recording is read, and what it does not state is estimated; the map appears with the first frame."
 
 
@@ -148,13 +147,13 @@ class MissionView:
 
     def _contents(self) -> ViewContents:
         mapper, graph = self._mission.mapper, self._mission.graph
-        trajectory = mapper.poses.trajectory()
+        times_ns, path = mapper.poses.path()
         return replace(
             ViewContents.of_one_agent(mapper.gaussians(), "this run"),
             targets=() if graph is None else graph.targets,
             objects=mapper.objects,
-            times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
-            T_world_camera=trajectory.T_world_camera,
+            times_ns=times_ns,
+            T_world_camera=path,
             keyframes=[_view(keyframe) for keyframe in mapper.keyframes()],
         )
 

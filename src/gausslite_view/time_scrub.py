@@ -64,7 +64,8 @@ class TimeScrub:
         self._folder.visible = span_s >= 2 * _STEP_S
         if self._folder.visible and span_s != self._seconds.max:
             self._seconds.max = span_s
-            if is_live:
+            # a mission that began again is shorter
+            if is_live or self._seconds.value > span_s:
                 self._seconds.value = span_s
 
     @property

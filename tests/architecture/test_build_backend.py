@@ -42,11 +42,25 @@ def test_a_clone_that_can_be_written_is_built_in_its_own_folder(backend: Any) ->
 def test_another_clone_is_built_in_a_folder_that_stays(
     backend: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(os, "access", lambda *_: False)
+    cache = tmp_path / "cache"
+    monkeypatch.setattr(os, "access", lambda path, _: path.is_relative_to(cache))
     first, second = backend.build_wheel("dist"), backend.build_editable("dist")
     assert first == second
-    assert Path(first).parent.is_relative_to(tmp_path / "cache")
+    assert Path(first).parent.is_relative_to(cache)
     assert Path(first).name == "{wheel_tag}"
     assert backend.build_wheel("dist", {"build-dir": "mine"}) == "mine"
+    # a cache that is a file, one of another user, and none
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     assert "gausslite-build-" in backend.build_wheel("dist")
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    assert "gausslite-build-" in backend.build_wheel("dist")
+    for variable in ("XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(variable)
+    monkeypatch.setattr("pwd.getpwuid", MagicMock(side_effect=KeyError))
+    assert "gausslite-build-" in backend.build_wheel("dist")
+
+
+def test_a_clone_with_a_file_named_build_is_built_elsewhere(backend: Any, tmp_path: Path) -> None:
+    Path("build").touch()
+    assert Path(backend.build_wheel("dist")).is_relative_to(tmp_path / "cache")

@@ -151,6 +151,7 @@ REFUSED = {
     "pose": ({"output0": raw()}, NAMES | {"task": "pose"}, None, "task pose, which finds keypoints"),
     "rotated": ({"output0": raw()}, NAMES | {"task": "obb"}, None, "rotated boxes"),
     "classes": ({"output0": np.zeros((1, 1000), np.float32)}, {}, None, "classify whole images"),
+    "whole batch": ({"output": np.zeros((9, 7), np.float32)}, NAMES, None, "all images of a batch, as YOLOv7"),
     "objectness": ({"output": np.zeros((1, 90, 85), np.float32)}, {}, None, "objectness, as YOLOv5 and YOLOX"),
     "heads": (
         {f"o{i}": np.zeros((1, 21, 8 >> i, 8 >> i), np.float32) for i in range(3)}, NAMES, None,
@@ -193,9 +194,22 @@ def test_values_out_of_range_are_named(tmp_path, rows, expected):
         )
 
 
-def test_names_may_stand_beside_the_file(tmp_path):
-    (tmp_path / "net.txt").write_text("cup\nchair\ntable\n", encoding="utf-8")
-    assert detector_of(tmp_path, {"output0": raw()}, {}, None).class_names == ("cup", "chair", "table")
+@pytest.mark.parametrize(
+    ("text", "first"),
+    [
+        ("cup\nchair\ntable\n", "cup"),
+        ("0\tcup\n1\tchair\n2\ttable", "cup"),
+        ("1 cup\n2 chair\n3 table", "cup"),
+        ("0,'cup'\n1,chair\n2,table", "cup"),
+        ("names:\n- cup\n- chair\n- table", "cup"),
+        ('["cup", "chair", "table"]', "cup"),
+        ("5 cent coin\nchair\ntable", "5 cent coin"),
+        ("5 cent coin\n6 chair\n7 table", "5 cent coin"),
+    ],
+)
+def test_names_may_stand_beside_the_file(tmp_path, text, first):
+    (tmp_path / "net.txt").write_text(text, encoding="utf-8")
+    assert detector_of(tmp_path, {"output0": raw()}, {}, None).class_names[0] == first
 
 
 def test_a_class_without_a_name_is_named(tmp_path):

@@ -160,6 +160,12 @@ def test_a_live_page_set_back_keeps_the_earlier_map_and_follows_again_at_the_end
         control(page, "Seconds").value = 99.0
         assert ">100 Gaussians" in text(page)
         assert "newest map" in text(page)
+        # a mission that begins again is shorter than what the slider was set to
+        control(page, "Seconds").value = 50.0
+        contents = replace(contents, state_ns=5_000_000_000)
+        page.remember(contents)
+        page.show(contents)
+        assert control(page, "Seconds").value == control(page, "Seconds").max == pytest.approx(4.0)
     finally:
         page.close()
 

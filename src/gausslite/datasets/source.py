@@ -20,7 +20,6 @@ from gausslite.domain.pose import Trajectory, UpAxis
 from gausslite.domain.relevance import Region
 
 Item = TypeVar("Item")
-_DOWNSCALED_PIXELS = 320 * 240
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,12 +268,7 @@ def frame_size(text: str | None, source: Source) -> tuple[int, int]:
     return width, height
 
 
-def downscaled_size(camera: Camera) -> tuple[int, int]:
-    """Return a size with the camera's aspect ratio and about as many pixels as 320x240, or its own size if smaller."""
-    return capped_size(camera, _DOWNSCALED_PIXELS)
-
-
-def capped_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
+def capped_size(camera: Camera, max_pixels: int = 320 * 240) -> tuple[int, int]:
     """Return a size with the camera's aspect ratio and about this many pixels, or its own size if smaller."""
     scale = min(1.0, math.sqrt(max_pixels / (camera.width_px * camera.height_px)))
     return round(scale * camera.width_px), round(scale * camera.height_px)

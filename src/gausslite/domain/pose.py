@@ -19,7 +19,6 @@ UpAxis = tuple[float, float, float]
 _RIGIDITY_TOLERANCE = 1e-2
 _UNIT_TOLERANCE = 1e-3
 _MIN_BASELINE_S = 1e-6
-_TYPICAL_DISTANCE_M = 2.0
 _MAX_GAP_RATIO = 2.0
 
 
@@ -183,11 +182,6 @@ class Twist:
 
     linear_m_s: Float64[ndarray, "3"]  # of the camera's centre
     angular_rad_s: Float64[ndarray, "3"]
-
-    @property
-    def typical_image_speed(self) -> float:
-        """Image motion in focal lengths per second, of a point at a distance of 2 m."""
-        return float(np.linalg.norm(self.angular_rad_s) + np.linalg.norm(self.linear_m_s) / _TYPICAL_DISTANCE_M)
 
     def motion(self, seconds: float) -> Float64[ndarray, "4 4"]:
         """Return T_before_after of this motion for a time, to first order in the translation."""

@@ -228,7 +228,7 @@ class CameraView:
     camera: Camera
     frame_index: int
     T_world_camera: Float64[ndarray, "4 4"]
-    times_ns: Int64[ndarray, " t"]  # the capture times of the path, oldest first
+    times_ns: Int64[ndarray, " t"]  # of the path, oldest first; they go on where the clock was set
     path: Float64[ndarray, "t 4 4"]  # pose of each mapped frame
     keyframes: Float64[ndarray, "k 4 4"]
     detected: DetectedImage | None = None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import MapFileError
@@ -20,6 +20,8 @@ _MAX_POSES = 20_000
 """Beyond this number, every second pose of the older half is removed: 5 MB."""
 _RECENT_POSES = 32
 """Frames whose changes of correction give its uncertainty."""
+_LONGEST_STEP_NS = 3600 * 10**9
+"""Between two frames of a path: after a longer one the clock was set."""
 _POSES = ("T_world_odometry", "T_world_prior", "T_world_map")
 
 
@@ -133,6 +135,14 @@ class PoseTable:
         return CorrectionTrack(
             times_ns, np.array([pose.T_world_map @ inverse(pose.T_world_odometry) for pose in poses])
         )
+
+    def path(self) -> tuple[Int64[ndarray, " n"], Float64[ndarray, "n 4 4"]]:
+        """Return times and poses in the order of mapping; where the clock was set, the times go on as before."""
+        times_ns = np.array([time_ns for _, time_ns in self._poses], np.int64)
+        steps_ns = np.diff(times_ns, prepend=times_ns[:1])
+        steps_ns[(steps_ns < 0) | (steps_ns > _LONGEST_STEP_NS)] = 0
+        poses = np.array([pose.T_world_map for pose in self._poses.values()]).reshape(-1, 4, 4)
+        return times_ns[:1] + steps_ns.cumsum(), poses
 
     def trajectory(self) -> Trajectory:
         """Return the latest estimate of every frame's pose in the map, by time."""

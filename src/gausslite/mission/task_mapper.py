@@ -40,7 +40,6 @@ REPEATED: Final = "the colour image is the one before, although the pose moved"
 MOVING: Final = "everything moves"
 _LEAST_MOTION_M, _LEAST_MOTION_DEG = 0.02, 1.0
 """An image that is repeated at a pose within these is of a robot at rest."""
-_NS_PER_S = 1e9
 _MAX_SHOWN = 16
 _MAX_REEVALUATED = 3
 """Earlier keyframes that are evaluated again with each frame, after a task change and when an object becomes known."""
@@ -205,7 +204,7 @@ class TaskMapper:
         keyframes = self.keyframes()
         if not keyframes:
             return None
-        newest, trajectory = keyframes[-1], self._mapper.poses.trajectory()
+        newest, (times_ns, path) = keyframes[-1], self._mapper.poses.path()
         if not self._shown or self._shown[-1].id != newest.frame.id:
             self._shown.append(newest.as_recorded)
         return CameraView(
@@ -214,8 +213,8 @@ class TaskMapper:
             camera=newest.frame.camera,
             frame_index=newest.frame.index,
             T_world_camera=newest.frame.T_world_camera,
-            times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
-            path=trajectory.T_world_camera,
+            times_ns=times_ns,
+            path=path,
             keyframes=np.stack([keyframe.frame.T_world_camera for keyframe in keyframes]),
             detected=self._detected,
         )

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.checks import require_whole
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.rasterizer import (
     DILATION_PX2,
@@ -95,6 +96,7 @@ def choose_threads(requested: int | None) -> int:
     if requested is None:
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         return min(available, cores_allowed(), MAX_THREADS)
+    require_whole("threads", requested)
     if not 1 <= requested <= MAX_THREADS:
         raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {requested}")
     return requested

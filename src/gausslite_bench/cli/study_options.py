@@ -13,7 +13,7 @@ from gausslite.codec.state_file import write_atomic
 from gausslite.config.option import build, option
 from gausslite.config.program import add_flags
 from gausslite.datasets.regions import REGIONS_FILE
-from gausslite.datasets.source import downscaled_size
+from gausslite.datasets.source import capped_size
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.recording import RecordingOptions, calibrate_with_messages, open_recorded, stated_values
 from gausslite.mission.results import as_text, write_json
@@ -120,7 +120,7 @@ def real_sequence_plans(
     found = calibrate_with_messages(spec, open_recorded(spec, options.up), stated)
     correction = None if found.correction.is_identity else found.correction
     plans = [replace(plan, depth_registration=found.registration, camera_correction=correction) for plan in plans]
-    return plans, downscaled_size(found.source.camera)
+    return plans, capped_size(found.source.camera)
 
 
 def write_results(folder: Path, name: str, table: str, trials: Sequence[Mapping[str, object]]) -> str:

@@ -10,7 +10,7 @@ import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.source import downscaled_size, frame_size, numbering_note, select_frames
+from gausslite.datasets.source import capped_size, frame_size, numbering_note, select_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.relevance import BallRegion, VoxelRegion
@@ -134,8 +134,8 @@ def test_resizing_averages_colour_and_selects_depth(tmp_path: Path) -> None:
         ((160, 120), (160, 120)),
     ],
 )
-def test_a_downscaled_size_keeps_the_aspect_ratio(recorded: tuple[int, int], modest: tuple[int, int]) -> None:
-    assert downscaled_size(Camera(500.0, 500.0, 320.0, 240.0, *recorded)) == modest
+def test_a_capped_size_keeps_the_aspect_ratio(recorded: tuple[int, int], modest: tuple[int, int]) -> None:
+    assert capped_size(Camera(500.0, 500.0, 320.0, 240.0, *recorded)) == modest
 
 
 @pytest.mark.parametrize("write", [write_tum, write_seven_scenes, write_replica])

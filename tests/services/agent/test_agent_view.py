@@ -1,5 +1,6 @@
 """The page of an agent in a real browser: its map appears, and a task assigned there arrives at the agent."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -19,7 +20,7 @@ from gausslite_objects.memory_client import ServerMemory
 from gausslite_view.pages import live_page, own_address
 
 pytest.importorskip("viser")
-from page_controls import SeenPage, plot, poll_until
+from page_controls import SeenPage, control, plot, poll_until, text
 
 from gausslite_view.agent_panel import AgentPanel
 from gausslite_view.decoding import camera_view_from_message
@@ -106,6 +107,28 @@ def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe(robot: A
         rendered, _ = client.render(frame(0).camera, frame(0).T_world_camera)
         full_db = plot(page, "training PSNR, full image (dB)")["dB"][0]
         assert full_db == pytest.approx(psnr(rendered, camera_view_from_message(client.camera_view()).rgb), abs=1.0)
+    finally:
+        panel.close()
+        page.close()
+
+
+def test_the_slider_goes_on_where_the_robots_clock_was_set(robot: Agent):
+    page, client = SeenPage(), AgentClient(robot.client.address)
+    panel = AgentPanel(page, client, ServerMemory(client.address))
+    try:
+        robot.client.assign_task(TASK)
+        # two hours earlier, and a year later
+        for number, start_s in enumerate((9_000, 1_800, 31_000_000)):
+            stamps_ns = [start_s * 10**9 + (index + 1) * 10**8 for index in range(3)]
+            frames = [replace(frame(index), capture_time_ns=stamp_ns) for index, stamp_ns in enumerate(stamps_ns)]
+            assert list(robot.client.ingest(frames))[-1].gaussians > 0
+            poll_until(panel.poll, lambda number=number: len(page.contents.times_ns) == 3 * (number + 1))
+            seconds = 0.2 * (number + 1)
+            assert control(page, "Seconds").max == control(page, "Seconds").value == pytest.approx(seconds)
+            assert f"the newest map, after {seconds:.1f} s" in text(page)
+            np.testing.assert_allclose(page.contents.T_world_camera[-1], frame(2).T_world_camera, atol=0.05)
+        control(page, "Seconds").value = 0.0
+        assert "the map as it was after" in text(page)
     finally:
         panel.close()
         page.close()
