@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from jaxtyping import Float64
 from numpy import ndarray
@@ -27,6 +27,9 @@ from gausslite_relocalisation.agreement import Agreement, compare, is_another_pl
 from gausslite_relocalisation.motion import Doubt, OdometrySteps
 from gausslite_relocalisation.piece import Piece
 from gausslite_relocalisation.place_search import PlaceSearch
+
+if TYPE_CHECKING:
+    from gausslite.wire.uplink import Uplink
 
 _EARLIER = 3
 """The newest keyframes that a frame is compared with."""
@@ -46,12 +49,14 @@ _CONTRADICTION: Final = "its images contradict the map"
 class FrameMonitor(LocalisationMonitor):
     """Judges the frames of one mission. Not thread-safe."""
 
-    def __init__(self, prior: PriorMap | None = None, in_background: bool | None = None) -> None:
-        """prior: the earlier map that the mission continues.
+    def __init__(
+        self, prior: PriorMap | None = None, in_background: bool | None = None, uplink: Uplink | None = None
+    ) -> None:
+        """prior: the earlier map that the mission continues. uplink: to the server that has the team's map.
 
         in_background: whether live frames are compared with each other there; None: they were compared before.
         """
-        self._prior, self._in_background = prior, in_background
+        self._prior, self._in_background, self._uplink = prior, in_background, uplink
         self._check = None if in_background is None else LiveCheck(in_background)
         self._refusal = ""
         self._localisation = LocalisationState.TRACKED
@@ -170,7 +175,7 @@ class FrameMonitor(LocalisationMonitor):
         self._doubtful += 1
         if self._doubtful >= _LOST_AFTER:
             self._localisation = LocalisationState.LOST
-            self._search = self._search or PlaceSearch(mapper, self._prior)
+            self._search = self._search or PlaceSearch(mapper, self._prior, self._uplink)
             T_map_odometry = self._search.offer(frame)
             if T_map_odometry is not None:
                 return self._end_doubt(frame, T_map_odometry)
@@ -193,14 +198,15 @@ class FrameMonitor(LocalisationMonitor):
 
     def _admit_apart(self, piece: Piece, frame: Frame, mapper: GaussianMapper) -> Admission:
         """Map a frame in the piece; join the piece as soon as the map shows its place."""
-        self._search = self._search or PlaceSearch(mapper, self._prior)
+        self._search = self._search or PlaceSearch(mapper, self._prior, self._uplink)
         mapped = piece.add(frame)
         T_map_piece = None if mapped is None else self._search.offer(mapped)
         if T_map_piece is not None:
             joined = piece.joined(mapper, T_map_piece)
+            apart = len(piece) - 1
             self._piece, self._joined, self._found = None, self._joined + 1, self._found + 1
-            # once more, now with the task
-            return replace(self._end_doubt(frame), joined=joined)
+            # this frame once more, now with the task
+            return replace(self._end_doubt(frame), joined=joined, mapped_apart=apart)
         if piece.is_lost:
             self._piece, self._left = None, self._left + 1
             self._begin_odometry()

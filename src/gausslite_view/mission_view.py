@@ -135,9 +135,10 @@ class MissionView:
         self._due_s = max(now_s + _INTERVAL_S, ended_s + (ended_s - now_s) * (1 / _MOST_SHARE - 1))
 
     def _show_task(self) -> None:
-        """Show the sentence that is mapped for: the field may hold one that was refused."""
+        """Show the sentence that is mapped for, as the field may hold one that was refused, and what is to be noted."""
         graph = self._mission.graph
-        shown = text_html([f"task: {graph.text}" if graph is not None and graph.text else "no task"])
+        task = f"task: {graph.text}" if graph is not None and graph.text else "no task"
+        shown = text_html([task, *self._mission.mapper.notes])
         if self._current.content != shown:
             self._current.content = shown
 

@@ -14,9 +14,11 @@ from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings
 from gausslite.mission.localisation_monitor import UNPLACED, LocalisationState
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.runner import MissionTotals
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.cpu import CpuRasterizer
+from gausslite_agent.state import FrameReport, Outcome, StatusHolder, WorkerStatus
 from gausslite_relocalisation.monitor import FrameMonitor
 from gausslite_relocalisation.piece import Piece
 
@@ -69,12 +71,20 @@ def _require_joined(mission: TaskMapper, true: Sequence[np.ndarray]) -> None:
 
 def test_a_piece_is_no_part_of_the_map_before_the_robot_is_found_and_is_joined_then(camera: MapCamera) -> None:
     mission, resumed = _mission(), _mission()
+    totals, agent = MissionTotals(), StatusHolder(WorkerStatus())
+
+    def count(outcome: FrameOutcome) -> FrameOutcome:
+        totals.add(outcome)
+        kind = Outcome.MAPPED if outcome.skipped is None else Outcome.SKIPPED
+        agent.count(FrameReport(outcome.index, kind), 0, outcome if kind is Outcome.MAPPED else None)
+        return outcome
+
     for frame in _frames(camera, HERE):
-        mission.process(frame)
+        count(mission.process(frame))
     before = mission.gaussians()
     frames = _carried(camera, [*AWAY, *BACK, *HERE])
     for frame in frames[: len(AWAY)]:
-        outcome = mission.process(frame)
+        outcome = count(mission.process(frame))
         assert (outcome.skipped, len(mission.gaussians())) == (UNPLACED, len(before))
     assert np.array_equal(mission.gaussians().means_m, before.means_m)
     assert mission.localisation is LOST
@@ -82,11 +92,14 @@ def test_a_piece_is_no_part_of_the_map_before_the_robot_is_found_and_is_joined_t
     assert "frames are mapped apart, and left out of the map until its place is found" in note
     resumed.restore(mission.state())
     for frame in frames[len(AWAY) :]:
-        resumed.process(frame)
+        count(resumed.process(frame))
     assert resumed.localisation is TRACKED
     assert resumed.notes[-1] == "pieces that were mapped apart: 1 joined to the map, 0 left out"
     _require_joined(resumed, [*AWAY, *BACK, *HERE])
     assert len(resumed.gaussians()) > 1.5 * len(before)
+    mapped = len(resumed.poses)
+    assert (totals.frames, agent.status.mapped) == (mapped, mapped)
+    assert totals.skipped == agent.status.skipped == len(HERE) + len(frames) - mapped
 
 
 @pytest.mark.slow

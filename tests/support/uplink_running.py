@@ -27,10 +27,14 @@ WAIT_S = 20.0
 
 @contextmanager
 def uplink(
-    address: str, options: UplinkSettings = EAGER, spool: Path | None = None, grid: VoxelGrid = GRID
+    address: str,
+    options: UplinkSettings = EAGER,
+    spool: Path | None = None,
+    grid: VoxelGrid = GRID,
+    agent_id: str = "robot",
 ) -> Iterator[Uplink]:
-    opened_spool = Spool(spool, "robot", grid)
-    link = Uplink(FusionClient(address, token=opened_spool.token), "robot", opened_spool, grid, options)
+    opened_spool = Spool(spool, agent_id, grid)
+    link = Uplink(FusionClient(address, token=opened_spool.token), agent_id, opened_spool, grid, options)
     try:
         yield link
     finally:

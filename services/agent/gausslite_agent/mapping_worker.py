@@ -293,7 +293,7 @@ class MappingWorker:
                 FrameScheduler(self._settings.scheduler_settings, self._clock),
                 self._publish,
                 tracker=build_tracker(self._settings, self._mapper),
-                monitor=open_monitor(self._settings, self.prior, in_background=True),
+                monitor=open_monitor(self._settings, self.prior, in_background=True, uplink=self.uplink),
             )
         elif current is None or graph.context != current.context or not graph.is_equivalent_to(current):
             change = self._task_mapper.extend if is_extended else self._task_mapper.assign

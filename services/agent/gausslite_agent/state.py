@@ -206,6 +206,7 @@ class WorkerStatus:
     map_revision: int = 0  # grows with each change of the map
     gaussians: int = 0  # in the map
     mapped: int = 0
+    joined: int = 0  # those of them that were mapped apart, without the task
     skipped: int = 0  # frames with a defect or without a place
     dropped: int = 0  # frames that newer ones replaced in the queue
     rejected: int = 0  # invalid frames
@@ -256,12 +257,12 @@ class WorkerStatus:
     @property
     def hz(self) -> float:
         """Mapped frames per second of perception and mapping."""
-        return self.mapped / self.busy_s if self.busy_s > 0 else 0.0
+        return (self.mapped - self.joined) / self.busy_s if self.busy_s > 0 else 0.0
 
     @property
     def roi_share(self) -> float:
         """Mean share of the pixels in the task's region."""
-        return self.roi_share_sum / max(self.mapped, 1)
+        return self.roi_share_sum / max(self.mapped - self.joined, 1)
 
     def age_s(self, percent: float) -> float:
         """Return the percentile of the latest frames' ages; 0 before the first."""
@@ -303,9 +304,12 @@ class StatusHolder:
         """Count one frame; outcome: that of a mapped one."""
         with self._lock:
             if outcome is not None:
-                status = replace(self.status, skipped=self.status.skipped + 1 - len(outcome.mapped))
-                for mapped in outcome.mapped:
-                    status = status.with_mapped(mapped, report.age_s)
+                joined = min(outcome.joined, self.status.skipped)
+                skipped = self.status.skipped + 1 - joined - len(outcome.mapped)
+                mapped, joined = self.status.mapped + joined, self.status.joined + joined
+                status = replace(self.status, mapped=mapped, joined=joined, skipped=skipped)
+                for placed in outcome.mapped:
+                    status = status.with_mapped(placed, report.age_s)
             else:
                 kind = report.outcome.value
                 status = replace(self.status, **{kind: getattr(self.status, kind) + 1})

@@ -36,7 +36,8 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
     Resets the density statistics.
     """
     max_added = min(table.free_slots, math.ceil(settings.max_growth * table.count))
-    chosen = _largest_above(_mean_gradient(table), settings.min_mean_gradient, max_added)
+    mean_gradient = table.first_moment[:, GRAD_2D_SUM] / np.maximum(table.first_moment[:, GRAD_2D_COUNT], 1.0)
+    chosen = _largest_above(mean_gradient, settings.min_mean_gradient, max_added)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m  # 3DGS: small ones lack neighbours, large ones detail
     to_clone, to_split = chosen[small], chosen[~small]
@@ -52,12 +53,6 @@ def prune(table: SplatTable, settings: DensitySettings) -> int:
     before = table.count
     table.keep(table.opacities >= settings.min_opacity)
     return before - table.count
-
-
-def _mean_gradient(table: SplatTable) -> Float32[ndarray, " n"]:
-    visible_steps = table.first_moment[:, GRAD_2D_COUNT]
-    mean: Float32[ndarray, " n"] = table.first_moment[:, GRAD_2D_SUM] / np.maximum(visible_steps, 1.0)
-    return mean
 
 
 def _largest_above(gradient: Float32[ndarray, " n"], threshold: float, max_count: int) -> Int64[ndarray, " m"]:

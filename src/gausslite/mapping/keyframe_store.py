@@ -146,9 +146,10 @@ class KeyframeStore:
         """Mark all keyframes as not evaluated for the new task; their relevance is empty until then."""
         shapes = {keyframe.frame.depth_m.shape for keyframe in self._keyframes.values()}
         empty = {shape: RelevanceMap.empty(*shape) for shape in shapes}
+        no_tiles = {shape: Subset(tiles_touching(np.zeros(shape, np.bool_), margin_px=0)) for shape in shapes}
         self._update_all(
             lambda keyframe: replace(keyframe, relevance=empty[keyframe.frame.depth_m.shape], evaluated=False),
-            lambda view: replace(view, roi=_no_tiles(view.keyframe.frame)),
+            lambda view: replace(view, roi=no_tiles[view.keyframe.frame.depth_m.shape]),
         )
 
     def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
@@ -240,10 +241,6 @@ class KeyframeStore:
     def _newest_first(self) -> Iterator[Keyframe]:
         """Yield the window's keyframes, then the buffer's, each the newest first."""
         return itertools.chain((view.keyframe for view in reversed(self.window)), reversed(self.buffer))
-
-
-def _no_tiles(frame: Frame) -> Subset:
-    return Subset(tiles_touching(np.zeros(frame.depth_m.shape, np.bool_), margin_px=0))
 
 
 def _most_redundant(keyframes: Sequence[Keyframe]) -> int:

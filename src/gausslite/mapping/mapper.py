@@ -100,7 +100,7 @@ class GaussianMapper:
         initial_map: see `continue_map`. Without a corrector, poses are only refined; without a pager, all is in memory.
         """
         self.settings = settings
-        self._rasterizer = rasterizer
+        self.rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
         self.table = SplatTable(settings.max_gaussians)
         self.pager = pager or MapPager()
@@ -137,7 +137,7 @@ class GaussianMapper:
         """Return an empty map with the same settings, for as many Gaussians as still fit into this one."""
         settings = replace(self.settings, max_gaussians=max(self.table.free_slots, 1))
         corrector = None if self.corrector is None else self.corrector.begin_another()
-        return GaussianMapper(settings, self._rasterizer, corrector=corrector)
+        return GaussianMapper(settings, self.rasterizer, corrector=corrector)
 
     def look(self, frame: Frame, scheduler: StageScheduler) -> FrameView:
         """Return the frame with the map rendered from its pose, unless the scheduler skips seeding."""
@@ -266,7 +266,7 @@ class GaussianMapper:
         return self._render(camera, T_world_camera, motion)
 
     def _render(self, camera: Camera, T_world_camera: _Pose, motion: CameraMotion | None = None) -> Rendering:
-        return self._rasterizer.forward(self.table.rows, camera, inverse(T_world_camera), motion=motion)
+        return self.rasterizer.forward(self.table.rows, camera, inverse(T_world_camera), motion=motion)
 
     def gaussians(self, active_only: bool = False, unsent_only: bool = False) -> Gaussians:
         """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0.
@@ -397,7 +397,7 @@ class GaussianMapper:
             return motions
 
     def _window_view(self, keyframe: Keyframe) -> WindowView:
-        return window_view(keyframe, self._rasterizer, self.settings.keyframes)
+        return window_view(keyframe, self.rasterizer, self.settings.keyframes)
 
     def _seed(self, keyframe: Keyframe, rendered: RenderedView | None, scheduler: StageScheduler) -> int:
         """Add Gaussians where the map does not explain the frame (Sec. III-C); return how many."""

@@ -185,7 +185,8 @@ class Seeder:
         Only pixels that the map does not explain yet are candidates. surface: the frame with the depth of the seeds.
         """
         settings = self._settings
-        budget = self._budget(frame, context)
+        seeds = settings.first_frame_seeds if context.rendered is None else settings.later_seeds
+        budget = max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))  # N, for this image size
         seedable = (surface.depth_m > 0) & (surface.depth_m <= settings.max_depth_m)
         roi_candidates = candidates = seedable  # an empty map explains nothing
         if context.rendered is not None:
@@ -228,11 +229,6 @@ class Seeder:
         density = min(max_density, max(affordable, settings.min_density_ratio * max_density))
         count = min(budget, int(np.ceil(density * np.count_nonzero(pixels))))
         return _Pool(pixels, count, stratified=self._components.sis)
-
-    def _budget(self, frame: Frame, context: SeedingContext) -> int:
-        """Return N, the seed budget of the frame, for this image size."""
-        seeds = self._settings.first_frame_seeds if context.rendered is None else self._settings.later_seeds
-        return max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))
 
     def _pixel_weights(self, frame: Frame) -> Float32[ndarray, "h w"]:
         """GFD (Sec. III-C.3): return E(u, v) + ε, the sampling weight of each pixel; without GFD it is uniform."""

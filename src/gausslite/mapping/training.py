@@ -26,7 +26,7 @@ from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.mapping.view_rotation import ViewRotation
 from gausslite.mapping.window_view import WindowView
-from gausslite.render.rasterizer import AdamSettings, Rasterizer, Subset, UpdateCounter
+from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
 """Visits behind the running mean; before that many, the region counts as improving."""
@@ -137,7 +137,8 @@ class Trainer:
     ) -> None:
         self._settings = settings
         self._adam, self._loss = settings.optimization.adam, settings.optimization.loss
-        self._half_size_adam = _with_half_rates(self._adam)
+        rates = ("means", "log_scales", "quats", "opacity_logits", "rgb")
+        self._half_size_adam = replace(self._adam, **{name: 0.5 * getattr(self._adam, name) for name in rates})
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng
@@ -319,11 +320,6 @@ class Trainer:
             with scheduler.timing(Stage.DENSIFICATION):
                 densify(self._table, density, extent_m)
             self._since_densify = 0
-
-
-def _with_half_rates(adam: AdamSettings) -> AdamSettings:
-    rates = ("means", "log_scales", "quats", "opacity_logits", "rgb")
-    return replace(adam, **{name: 0.5 * getattr(adam, name) for name in rates})
 
 
 def _uniform_draws(rng: np.random.Generator) -> Iterator[float]:

@@ -6,7 +6,7 @@ import copy
 import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.domain.gaussians import Gaussians
@@ -37,12 +37,15 @@ from gausslite.plugins import Group, find, load
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
 
+if TYPE_CHECKING:
+    from gausslite.wire.uplink import Uplink
+
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
 _GRID = VoxelGrid()
-OpenMonitor = Callable[[PriorMap | None, bool | None], LocalisationMonitor]
-"""The plug-in of `gausslite.monitors`, with the earlier map that the mission continues, if any, and whether live frames
-are compared with each other in the background; None: a recording's frames, which were compared before."""
+OpenMonitor = Callable[[PriorMap | None, bool | None, "Uplink | None"], LocalisationMonitor]
+"""The plug-in of `gausslite.monitors`, with the earlier map that the mission continues; whether live frames are
+compared with each other in the background, None: a recording's frames, compared before; and the link to a server."""
 
 
 def build_mapper(settings: MissionSettings, prior: Gaussians | None = None, grid: VoxelGrid = _GRID) -> GaussianMapper:
@@ -84,15 +87,18 @@ def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTr
 
 
 def open_monitor(
-    settings: MissionSettings, prior: PriorMap | None = None, in_background: bool | None = None
+    settings: MissionSettings,
+    prior: PriorMap | None = None,
+    in_background: bool | None = None,
+    uplink: Uplink | None = None,
 ) -> LocalisationMonitor | None:
     """Return what judges the place of each frame; None with `force`, where the camera is tracked, or without a plug-in.
 
-    in_background: see `OpenMonitor`.
+    in_background, uplink: see `OpenMonitor`.
     """
     is_needed = settings.poses is not PoseMode.TRACK and not settings.force
     open_plugin: OpenMonitor | None = find(Group.MONITORS) if is_needed else None
-    return None if open_plugin is None else open_plugin(prior, in_background)
+    return None if open_plugin is None else open_plugin(prior, in_background, uplink)
 
 
 def chosen_detector(perception: PerceptionSettings) -> Detector | None:

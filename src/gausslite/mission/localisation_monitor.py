@@ -33,6 +33,7 @@ class Admission:
     T_map_odometry: Float64[ndarray, "4 4"] | None = None  # of a robot that was found again
     reason: str = UNPLACED
     joined: State | None = None  # of the mapper, with a piece of map that was begun apart and has its place now
+    mapped_apart: int = 0  # frames of this piece
 
 
 @runtime_checkable

@@ -99,6 +99,7 @@ class MissionTotals:
     """Sums over the frames of a mission."""
 
     frames: int = 0  # mapped ones
+    joined: int = 0  # those of them that were mapped apart, without the task
     reasons: Counter[str] = field(default_factory=Counter)  # of the skipped frames
     late: int = 0  # those of them that missed their deadline
     iterations: int = 0
@@ -111,7 +112,7 @@ class MissionTotals:
     @property
     def hz(self) -> float:
         """Mapped frames per second of perception and mapping, without reading files."""
-        return self.frames / self.busy_s if self.busy_s > 0 else 0.0
+        return (self.frames - self.joined) / self.busy_s if self.busy_s > 0 else 0.0
 
     @property
     def skipped(self) -> int:
@@ -128,6 +129,10 @@ class MissionTotals:
         for waited in outcome.recovered:
             self.reasons[UNPLACED] -= 1
             self.add(waited)
+        # a resumed mission has not counted those from before
+        joined = min(outcome.joined, self.reasons[UNPLACED])
+        self.frames, self.joined = self.frames + joined, self.joined + joined
+        self.reasons -= Counter({UNPLACED: joined})
         self.keyframes_reevaluated += outcome.reevaluation.keyframes
         self.seeded_in_keyframes += outcome.reevaluation.seeded
         self.region_seen |= outcome.roi_share > 0
@@ -168,7 +173,7 @@ class MissionResult:
             "frames_skipped": totals.skipped,
             "frames_late": totals.late,
             "iterations": totals.iterations,
-            "roi_share": totals.roi_share_sum / max(totals.frames, 1),
+            "roi_share": totals.roi_share_sum / max(totals.frames - totals.joined, 1),
             "keyframes_reevaluated": totals.keyframes_reevaluated,
             "seeded_in_keyframes": totals.seeded_in_keyframes,
             "hz": totals.hz,

@@ -32,7 +32,7 @@ from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.mission.localisation_monitor import UNPLACED, Admission, LocalisationMonitor, LocalisationState
 from gausslite.perception.pointing import PointedMask, pointed_masks
-from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
+from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimator
 from gausslite.render.rasterizer import Rendering
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
@@ -64,6 +64,7 @@ class FrameOutcome:
     reevaluation: Reevaluation = field(default_factory=Reevaluation)  # the earlier keyframes evaluated for a new task
     localisation: LocalisationState = LocalisationState.TRACKED  # whether the robot's place was known
     recovered: tuple[FrameOutcome, ...] = ()  # of frames that waited for the robot's place, mapped before this one
+    joined: int = 0  # frames of a piece of map that was mapped apart and is part of the map now
 
     @property
     def mapped(self) -> tuple[FrameOutcome, ...]:
@@ -285,7 +286,7 @@ class TaskMapper:
         for waiting in admitted.frames[:-1]:
             recovered.append(self._process_placed(waiting))
             self._scheduler.begin(0.0)
-        return replace(self._process_placed(frame), recovered=tuple(recovered))
+        return replace(self._process_placed(frame), recovered=tuple(recovered), joined=admitted.mapped_apart)
 
     def _process_placed(self, frame: Frame) -> FrameOutcome:
         """Process a frame whose place is known."""
@@ -302,7 +303,8 @@ class TaskMapper:
         view = self._mapper.leave_out_moving(view, self._scheduler)
         if view.frame.defect:
             return self._skip_defect(frame, MOVING)
-        estimate = self._estimate_relevance(view)  # w(u, v), Sec. III-B
+        with self._scheduler.timing(Stage.RELEVANCE):  # w(u, v), Sec. III-B
+            estimate = self._estimator.estimate(view.frame, None if view.rendered is None else view.rendered.depth_m)
         self._detected = estimate.detected or self._detected
         lag_frames = self._apply_delayed(estimate.delayed)  # before the frame: its training uses that region
         reevaluation = self._reevaluate_keyframes()  # a new task first needs what the map has of it
@@ -365,10 +367,6 @@ class TaskMapper:
         """Return the outcome of a frame that is not mapped."""
         count, timing, localisation = self._mapper.count, self._scheduler.end(), self.localisation
         return FrameOutcome(frame.index, 0, count, 0.0, timing, reason, localisation=localisation)
-
-    def _estimate_relevance(self, view: FrameView) -> RelevanceEstimate:
-        with self._scheduler.timing(Stage.RELEVANCE):
-            return self._estimator.estimate(view.frame, None if view.rendered is None else view.rendered.depth_m)
 
     def _apply_delayed(self, delayed: DelayedRelevance | None) -> int | None:
         """Update an earlier keyframe with its delayed relevance, and return the delay in frames."""

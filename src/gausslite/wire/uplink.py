@@ -42,7 +42,7 @@ class Uplink:
         has_restored_map: bool = False,
     ) -> None:
         """has_restored_map: the map was restored from a checkpoint, so that the updates sent before stay valid."""
-        self._client, self._agent_id, self._grid = client, agent_id, grid
+        self.client, self.agent_id, self._grid = client, agent_id, grid
         self.spool = spool
         """What waits, and what the server has."""
         self._settings = settings or UplinkSettings()
@@ -134,7 +134,7 @@ class Uplink:
         self._wake()
         self._thread.join(_LEAVE_S)
         # cancels a call in flight, so that the thread does not block on the network
-        self._client.close()
+        self.client.close()
         self._thread.join()
         self.spool.close()
 
@@ -158,7 +158,7 @@ class Uplink:
                         self._recover(error)
             if self._session is not None and not self._last_error:
                 # ends the lease, so that a robot without its spool can take the name again at once
-                self._client.leave(self._session.session_id)
+                self.client.leave(self._session.session_id)
         except Exception as error:
             # `close` makes a call in flight fail
             if not self._closing:
@@ -211,7 +211,7 @@ class Uplink:
             # the server did not know the session
             self._join_if_needed()
             return
-        kept = self._client.keep_session(self._session.session_id, self._localisation)
+        kept = self.client.keep_session(self._session.session_id, self._localisation)
         self._next_check_s = time.monotonic() + self._settings.check_interval_s
         if kept.alignment.message != self._frame_message:
             self._frame_message = kept.alignment.message
@@ -230,12 +230,12 @@ class Uplink:
         if self.spool.is_stored_by(session.incarnation_id, session.highest_update_seq):
             return
         acknowledged = self.spool.acknowledged_digests()  # digests of tiles: a few bytes in place of the map
-        stored = self._client.stored_digests(session.session_id) if len(acknowledged.tiles) else acknowledged
+        stored = self.client.stored_digests(session.session_id) if len(acknowledged.tiles) else acknowledged
         resent = self.spool.begin_sending_to(
             session.incarnation_id, session.highest_update_seq, acknowledged.differing(stored)
         )
         if len(acknowledged.tiles):
-            _log.warning("uplink: %s lacks some of what it had; %d voxels are sent again", self._client, resent)
+            _log.warning("uplink: %s lacks some of what it had; %d voxels are sent again", self.client, resent)
 
     @property
     def _has_report(self) -> bool:
@@ -247,7 +247,7 @@ class Uplink:
         if report is None or report == self._sent_report:
             return
         try:
-            self._token_bucket.spend(self._client.report_objects(session.session_id, report))
+            self._token_bucket.spend(self.client.report_objects(session.session_id, report))
         except errors.InvalidInputError as error:
             # the map does not depend on it
             _log.warning("uplink: the report of objects is dropped: %s", error)
@@ -260,7 +260,7 @@ class Uplink:
         messages = [geometry_pb2.EncodedFrame.FromString(keyframe.data) for keyframe in due]
         selected = self.spool.keyframe_indices()
         deadline_s = self._settings.deadline_s
-        response = self._client.contribute_encoded_keyframes(session.session_id, messages, selected, deadline_s)
+        response = self.client.contribute_encoded_keyframes(session.session_id, messages, selected, deadline_s)
         self.spool.mark_keyframes_done(due)
         for rejection in response.rejected:
             _log.warning("uplink: keyframe %d is dropped: %s", rejection.index, rejection.reason)
@@ -275,7 +275,7 @@ class Uplink:
             fresh = self.spool.is_new and not self._has_restored_map and self._joins == 0
             report, frame = self._report, self._settings.world_frame
             task = None if report is None else report.graph
-            session = self._client.join(self._agent_id, self._grid, frame, fresh, task, self._settings.declared_frame)
+            session = self.client.join(self.agent_id, self._grid, frame, fresh, task, self._settings.declared_frame)
             self._resend_missing(session)
             self._session = session
             self.spool.mark_keyframes_missing(session.keyframes)
@@ -303,7 +303,7 @@ class Uplink:
 
     def _end_round(self, sent: bool) -> None:
         if sent and self._last_error:
-            _log.info("uplink: %s accepts updates again", self._client)
+            _log.info("uplink: %s accepts updates again", self.client)
             self._last_error = ""
         with self._changed:
             self._retry_delay.reset()
