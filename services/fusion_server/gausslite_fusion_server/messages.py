@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import tempfile
 from collections.abc import AsyncIterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import google_crc32c
 import numpy as np
@@ -192,6 +192,6 @@ def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
     """Encode the figures of one agent."""
     return pb.AgentContribution(
         **convert.values_of(agent, _CONTRIBUTION),
-        **asdict(agent.traffic),
+        **agent.traffic._asdict(),
         alignment=alignment_to_message(agent.alignment),
     )

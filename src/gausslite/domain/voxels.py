@@ -164,8 +164,8 @@ class AxisAlignedBox:
     max_m: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        corners = np.array([self.min_m, self.max_m])
-        if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
+        # a report has hundreds of boxes, for which arrays would take most of its time
+        if not all(-np.inf < low <= high < np.inf for low, high in zip(self.min_m, self.max_m, strict=True)):
             raise InvalidInputError(f"box: expected finite min <= max, got {self.min_m} and {self.max_m}")
 
     @classmethod

@@ -6,8 +6,9 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field
 from threading import Lock
+from typing import NamedTuple
 
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
@@ -104,8 +105,7 @@ class Acknowledgements:
             self._total_s += taken_s
 
 
-@dataclass(frozen=True, slots=True)
-class TrafficCounters:
+class TrafficCounters(NamedTuple):
     """Messages of one agent."""
 
     last_seen_ns: int = 0  # time of its latest subset or sign of life, 0 before
@@ -118,7 +118,7 @@ class TrafficCounters:
 
     def plus(self, newer: TrafficCounters) -> TrafficCounters:
         """Return the sums, with last_seen_ns of the newer counters, and its localisation if it states one."""
-        counts = zip(astuple(self)[2:], astuple(newer)[2:], strict=True)
+        counts = zip(self[2:], newer[2:], strict=True)
         localisation = newer.localisation or self.localisation
         return TrafficCounters(newer.last_seen_ns, localisation, *(own + more for own, more in counts))
 
@@ -133,7 +133,7 @@ class TrafficLog:
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         with self._lock:
-            self._by_agent[agent_id] = self.of(agent_id).plus(replace(traffic, last_seen_ns=time.time_ns()))
+            self._by_agent[agent_id] = self.of(agent_id).plus(traffic._replace(last_seen_ns=time.time_ns()))
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""

@@ -23,6 +23,8 @@ _FILL_AGENTS = 16
 _TOKEN = "bench"  # noqa: S105 - the same in all loads, so that the agents can join again
 _SETTLE_S = 60.0
 """Acknowledgements later than this after the last message are counted as missing."""
+_Times = list[tuple[int, float]]
+"""Of acknowledged messages: the number at their agent, and the time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +33,6 @@ class LoadResult:
 
     later_p99_ms: without the first second of each agent, whose first message stores its frame in a commit of its own.
     refused: reports of objects and keyframes that the server did not store.
-    server_cpu_ms: processor time of the server per message, which other programs on the machine hardly change.
     """
 
     agents: int
@@ -40,7 +41,6 @@ class LoadResult:
     p99_ms: float
     missing: int
     refused: int
-    server_cpu_ms: float = float("nan")
     later_p99_ms: float = float("nan")
 
 
@@ -76,17 +76,14 @@ class AgentLoad:
         messages = [delta_messages(name, number, count, self._next_seq) for number, name in enumerate(names)]
         self._next_seq += count
         times_s, refused = asyncio.run(self._send(sessions, messages))
-        p50, p99 = np.percentile([time_s for _, time_s in times_s] or [np.inf], [50, 99]) * 1000
-        later_s = [time_s for index, time_s in times_s if index >= RATE_HZ] or [np.nan]
-        missing = agents * count - len(times_s)
+        p50_ms, p99_ms = np.percentile([1000 * own_s for _, own_s in times_s] or [np.inf], [50, 99]).tolist()
+        later_s = [own_s for index, own_s in times_s if index >= RATE_HZ] or [np.nan]
         later_p99_ms = 1000 * float(np.percentile(later_s, 99))
-        return LoadResult(agents, agents * count, float(p50), float(p99), missing, refused, later_p99_ms=later_p99_ms)
+        total = agents * count
+        return LoadResult(agents, total, p50_ms, p99_ms, total - len(times_s), refused, later_p99_ms)
 
-    async def _send(
-        self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]
-    ) -> tuple[list[tuple[int, float]], int]:
-        """Return the number of each acknowledged message of its agent with its time, and the number of refusals."""
-        times_s: list[tuple[int, float]] = []
+    async def _send(self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]) -> tuple[_Times, int]:
+        times_s: _Times = []
         async with UpdateStreams(self._address) as streams:
             begin_s = time.monotonic() + 0.5
             begins_s = [begin_s + number / len(sessions) / RATE_HZ for number in range(len(sessions))]
@@ -96,8 +93,7 @@ class AgentLoad:
             ]
             refused: list[str] = []
             others = [asyncio.ensure_future(self._send_others(streams, sessions, begin_s, refused))]
-            duration_s = len(messages[0]) / RATE_HZ
-            _, late = await asyncio.wait(tasks, timeout=duration_s + _SETTLE_S)
+            _, late = await asyncio.wait(tasks, timeout=len(messages[0]) / RATE_HZ + _SETTLE_S)
             for task in (*late, *others):
                 task.cancel()
             await asyncio.gather(*tasks, *others, return_exceptions=True)
@@ -154,9 +150,7 @@ def load_of_frames(agent: AgentClient, seconds: float) -> LoadResult:
     return LoadResult(1, count, 1000 * end.age_p50_seconds, 1000 * end.age_p99_seconds, count - mapped, 0)
 
 
-async def _send_agent(
-    stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: list[tuple[int, float]]
-) -> None:
+async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: _Times) -> None:
     """Send one message each period; a time counts from when the message was due, also if the one before was late."""
     for index, data in enumerate(messages):
         due_s = begin_s + index / RATE_HZ

@@ -1,18 +1,16 @@
-"""Measure a fusion server: agents at 4 Hz, snapshot, status, restart and memory, by the Gaussians that it holds."""
+"""Measure a fusion server: agents at 4 Hz, snapshot, restart and memory, by the Gaussians that it holds."""
 
 from __future__ import annotations
 
-import itertools
 import shlex
 import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import median
 
 from gausslite.cli.progress import progress_bar
 from gausslite.config.option import option
@@ -21,14 +19,12 @@ from gausslite.fusion.limits import Quotas
 from gausslite.wire.clients import FusionClient
 from gausslite_bench.cli.study_options import names_among
 from gausslite_bench.report import Report
-from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult
+from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad
 from gausslite_bench.server.hostile import ATTACKS, measure_attack
 from gausslite_bench.server.stages import stages_ms
 from gausslite_bench.server.synthetic_updates import GAUSSIANS_PER_VOXEL
 from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
-_P99_LIMIT_MS = 100.0
-_STATUS_CALLS = 5
 _OTHERS = {
     "ParserService": "gausslite_parser",
     "AgentService": f"gausslite_agent --source sim:home --task 'Pick up the mug' --rate {RATE_HZ}",
@@ -101,32 +97,21 @@ def _measure(
 ) -> dict[str, object]:
     load = AgentLoad(server.address)
     on_progress(f"{held} Gaussians: fill")
-    begin_s = time.monotonic()
     load.fill(held, GAUSSIANS_PER_VOXEL)
-    fill_s = time.monotonic() - begin_s
-    loads: list[LoadResult] = []
+    loads = []
     for agents in settings.agents:
         on_progress(f"{held} Gaussians: {agents} agents")
         cpu_s = server.cpu_s()
         result = load.run(agents, settings.seconds)
-        loads.append(replace(result, server_cpu_ms=1000 * (server.cpu_s() - cpu_s) / result.messages))
-    on_progress(f"{held} Gaussians: snapshot, status, restart")
+        loads.append({**asdict(result), "server_cpu_ms": 1000 * (server.cpu_s() - cpu_s) / result.messages})
+    on_progress(f"{held} Gaussians: snapshot, restart")
     return {
         "held": held,
-        "largest_team": _largest_team(loads),
-        "loads": [asdict(result) for result in loads],
-        "fill_s": fill_s,
+        "loads": loads,
         "snapshot_s": _snapshot_s(server.address),
-        "status_ms": _status_ms(server.address),
         "rss_mib": server.rss_mib(),
         "restart_s": server.restart(),
     }
-
-
-def _largest_team(loads: Sequence[LoadResult]) -> int:
-    """Return the largest number of agents before the first with a p99 over the limit or a missing acknowledgement."""
-    passed = itertools.takewhile(lambda load: load.p99_ms <= _P99_LIMIT_MS and not load.missing, loads)
-    return max((load.agents for load in passed), default=0)
 
 
 def _snapshot_s(address: str) -> float:
@@ -137,14 +122,3 @@ def _snapshot_s(address: str) -> float:
         while not next(watch).last:
             pass
         return time.monotonic() - begin_s
-
-
-def _status_ms(address: str) -> float:
-    with FusionClient(address, deadline_s=600.0) as client:
-        client.status()
-        times_s = []
-        for _ in range(_STATUS_CALLS):
-            begin_s = time.monotonic()
-            client.status()
-            times_s.append(time.monotonic() - begin_s)
-        return 1000 * median(times_s)

@@ -15,8 +15,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,6 +55,7 @@ _TOKEN = "bad"  # noqa: S105 - of the attackers
 _NOUN = "mug"
 _TASK = f"Pick up the {_NOUN} on the table"
 _LONG_TASK = ", then ".join([_TASK] * 27)
+_client = partial(FusionClient, token=_TOKEN)
 
 
 def _note_begin(nice: int = 10) -> None:
@@ -60,10 +63,6 @@ def _note_begin(nice: int = 10) -> None:
     os.nice(nice)
     sys.stdout.write("attacking\n")
     sys.stdout.flush()
-
-
-def _client(address: str, deadline_s: float) -> FusionClient:
-    return FusionClient(address, deadline_s, token=_TOKEN)
 
 
 def _join(address: str, count: int) -> list[tuple[str, str]]:
@@ -109,11 +108,8 @@ def _flood(
                     call(client, number)
 
     _note_begin()
-    threads = [threading.Thread(target=repeat, args=(thread,), daemon=True) for thread in range(callers)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(callers) as pool:
+        list(pool.map(repeat, range(callers)))
 
 
 def _voxels(name: str, voxels: int) -> bytes:
@@ -348,12 +344,7 @@ def _watched(server: ServiceProcess) -> Iterator[list[tuple[float, bool, float]]
 
 def _run(arguments: Sequence[str]) -> None:
     attack, address = arguments
-
-    def exit_with_input() -> None:
-        sys.stdin.read()
-        os._exit(0)
-
-    threading.Thread(target=exit_with_input, daemon=True).start()
+    threading.Thread(target=lambda: os._exit(len(sys.stdin.read())), daemon=True).start()
     ATTACKS[attack].run(address)
 
 

@@ -27,9 +27,7 @@ from gausslite_fusion_server.contributions import Acknowledger, StoredCount
 
 
 class _TimedStore(SqliteStore):
-    """Adds up the processor time of its transactions."""
-
-    cpu_s = 0.0
+    cpu_s = 0.0  # of its transactions
 
     def put_all(self, updates: Sequence[EncodedSubset]) -> list[PutOutcome]:
         begin_s = time.thread_time()
@@ -51,26 +49,24 @@ def stages_ms(agents: int) -> dict[str, float]:
         engine, checks = FusionEngine(store, settings), UpdateChecks(store, settings.quotas, MissionClock(store))
         stream = Acknowledger(Caller("unix"), engine.traffic, RejectionLog(logging.getLogger(__name__)))
         sessions = [engine.join(name, MissionConfig("", "", GRID.size_m)).session for name in names]
+        sent = [own for subsets in zip(*messages, strict=True) for own in zip(sessions, subsets, strict=True)]
         times_s: list[ndarray] = []
-        for number, subsets in enumerate(zip(*messages, strict=True)):
-            if number == PATCHES:
+        for number, (session, data) in enumerate(sent):
+            if 2 * number == len(sent):
                 store.cpu_s, times_s = 0.0, []
-            for session, data in zip(sessions, subsets, strict=True):
-                request = update_request(session.session_id, number, data)
-                sent, stamps_s = request.SerializeToString(), [time.thread_time()]
-                request = request.FromString(sent)
-                subset = unpack_subset(request.subset)[0]
-                stamps_s.append(time.thread_time())
-                checks.require_permitted(subset)
-                stamps_s.append(time.thread_time())
-                put = engine.enqueue_update(session, subset)
-                engine.commit_updates()
-                stored = put.result()
-                stamps_s.append(time.thread_time())
-                counts = StoredCount(len(stored.accepted), len(stored.stale))
-                stream.accept(request, session.agent_id, counts).SerializeToString()
-                times_s.append(np.diff([*stamps_s, time.thread_time()]))
+            request = update_request(session.session_id, number, data)
+            received, stamps_s = request.SerializeToString(), [time.thread_time()]
+            subset = unpack_subset(request.FromString(received).subset)[0]
+            stamps_s.append(time.thread_time())
+            checks.require_permitted(subset)
+            stamps_s.append(time.thread_time())
+            put = engine.enqueue_update(session, subset)
+            engine.commit_updates()
+            counts = StoredCount(len(put.result().accepted), len(put.result().stale))
+            stamps_s.append(time.thread_time())
+            stream.accept(request, session.agent_id, counts).SerializeToString()
+            times_s.append(np.diff([*stamps_s, time.thread_time()]))
         decode, check, commit, acknowledge = (1000 * np.mean(times_s, axis=0)).tolist()
-        put_all = 1000 * store.cpu_s / len(times_s)
-    vote = commit - check - put_all
-    return {"decode": decode, "check": check, "store": put_all, "vote": vote, "acknowledge": acknowledge}
+        in_store = 1000 * store.cpu_s / len(times_s)
+    vote = commit - check - in_store
+    return {"decode": decode, "check": check, "store": in_store, "vote": vote, "acknowledge": acknowledge}

@@ -22,7 +22,6 @@ _PATCH_COLUMNS = np.array([6, 5])
 _PATCHES_IN_ROW = 64
 _FILL_VOXELS = 500
 PATCHES = 8
-"""Of an agent; each of its messages is one of them."""
 _NOISE_M, _COLOUR_NOISE = 0.001, 0.03
 
 
