@@ -89,7 +89,7 @@ class FrameMonitor(LocalisationMonitor):
             name = self._localisation.name.lower()
             now = f"the robot's place is {name} since frame {self._since}: {self._cause}; {frames}"
         elif self._doubts:
-            before = f"the robot's place was doubtful {self._doubts} times, and {self._found} times found in the map"
+            before = f"doubts about the robot's place: {self._doubts}; places found in the map: {self._found}"
         pieces = ""
         if self._joined or self._left:
             pieces = f"pieces that were mapped apart: {self._joined} joined to the map, {self._left} left out"

@@ -23,6 +23,9 @@ _USUAL = 3.0
 _JUMP_RATIO, _LEAST_JUMP_M, _LEAST_JUMP_DEG = 4.0, 0.3, 15.0
 """A step this much longer than the median, and this long, is compared with the images. Odometry that slips by less is
 refined, and corrected at loops."""
+_UNSHOWN = 0.6
+"""Error of the points by the odometry, as a share of their motion, with which too few matches to measure another motion
+do not show this one either."""
 _MIN_STEPS, _MAX_STEPS = 6, 30
 _SAME_PLACE_M, _SAME_PLACE_DEG = 0.2, 8.0
 """Poses that differ less from those by the images agree again: a jump is measured to a few centimetres."""
@@ -116,11 +119,13 @@ class OdometrySteps:
         pair = None
         if last is not None and last.camera == frame.camera:
             pair = match_pair(FrameWindow((last, frame)), 0, 1)
-        if pair is None:
+        by_odometry = np.eye(4) if last is None else inverse(frame.T_world_camera) @ last.T_world_camera
+        is_contradicted = pair is not None and pair.contradicts(by_odometry)
+        if pair is None or (is_too_far and not is_contradicted and pair.errors(by_odometry[None])[0] > _UNSHOWN):
             if is_too_far:
                 self.T_before_now = None
             return Doubt(f"the odometry jumped by {_text(step)}") if is_too_far else None
-        if last is None or not pair.contradicts(inverse(frame.T_world_camera) @ last.T_world_camera):
+        if last is None or not is_contradicted:
             return None
         T_last_frame = refined_by_images(last, frame, inverse(pair.matched.T_current_reference))
         if self.T_before_now is not None:

@@ -23,6 +23,7 @@ _FILE = "frames.csv"
 COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share", "localisation")
 """localisation: a value of `LocalisationState`."""
 _MAX_ROWS = 100_000
+_MAX_WAITED = 64
 
 
 @dataclass(slots=True)
@@ -33,10 +34,14 @@ class Timeline:
     _rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def add(self, outcome: FrameOutcome, _poses: PoseTable, _gaussians: Callable[[], Gaussians]) -> None:
-        """Add one frame."""
-        for shown in outcome.mapped or (outcome,) * (outcome.localisation > 0):
-            figures = shown.index, shown.timing.seconds, shown.iterations, shown.gaussians, shown.roi_share
-            self._rows.append((*figures, shown.localisation))
+        """Add one frame. Frames that waited have rows, with the state of the robot when they came."""
+        for waited in outcome.recovered:
+            newest = range(len(self._rows) - 1, max(len(self._rows) - _MAX_WAITED, 0) - 1, -1)
+            row = next((i for i in newest if self._rows[i][0] == waited.index), None)
+            if waited.skipped is None and row is not None:
+                self._rows[row] = (*_figures(waited), self._rows[row][-1])
+        if outcome.skipped is None or outcome.localisation > 0:
+            self._rows.append((*_figures(outcome), outcome.localisation))
         if len(self._rows) >= self.max_rows:
             del self._rows[1::2]
 
@@ -47,6 +52,10 @@ class Timeline:
         writer.writerow(COLUMNS)
         writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in self._rows)
         write_atomic(folder / _FILE, text.getvalue().encode())
+
+
+def _figures(outcome: FrameOutcome) -> tuple[float, ...]:
+    return outcome.index, outcome.timing.seconds, outcome.iterations, outcome.gaussians, outcome.roi_share
 
 
 def read_timeline(folder: Path) -> dict[str, Float64[ndarray, " n"]]:

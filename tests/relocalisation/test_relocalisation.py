@@ -19,7 +19,10 @@ from gausslite.mission.runner import MissionTotals
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.cpu import CpuRasterizer
+from gausslite_calibration.consistency import match_pair
+from gausslite_calibration.live_check import FrameWindow, compared
 from gausslite_relocalisation.monitor import FrameMonitor
+from gausslite_relocalisation.motion import OdometrySteps
 from gausslite_view.timeline import Timeline, read_timeline
 
 TRACKED, DOUBTFUL, LOST = LocalisationState
@@ -88,7 +91,20 @@ def _require_found(mission: TaskMapper, odometry: Frame) -> None:
     error = inverse(HERE[6]) @ correction.T_map_odometry @ odometry.T_world_camera
     assert translation_m(error, np.eye(4)) < 0.05
     assert rotation_angle_deg(error, np.eye(4)) < 1.5
-    assert mission.notes == ("the robot's place was doubtful 1 times, and 1 times found in the map",)
+    assert mission.notes == ("doubts about the robot's place: 1; places found in the map: 1",)
+
+
+def test_a_jump_too_far_for_a_robot_is_noticed_also_where_few_matches_show_another_motion(camera: MapCamera) -> None:
+    frames = [*_frames(camera, HERE), *_moved(_frames(camera, HERE[6:7], first=len(HERE)), T_OTHER)]
+    # depth in the left quarter of the image
+    few = [replace(frame, depth_m=np.where(np.arange(240) < 70, frame.depth_m, np.float32(0.0))) for frame in frames]
+    last, jumped = map(compared, few[-2:])
+    pair = match_pair(FrameWindow((last, jumped)), 0, 1)
+    assert pair is not None
+    assert not pair.contradicts(inverse(jumped.T_world_camera) @ last.T_world_camera)
+    steps = OdometrySteps()
+    assert [steps.add(frame) is not None for frame in few] == [False] * len(HERE) + [True]
+    assert steps.T_before_now is None
 
 
 @pytest.mark.parametrize("event", SHOWN.values(), ids=SHOWN)
