@@ -70,11 +70,8 @@ def write_numbers(values: Sequence[float]) -> str:
 
 def read_target_points(texts: Sequence[str]) -> tuple[TargetPoint, ...]:
     """Return the points of "x,y,z" or "x,y,z,r", in metres. Raises ArgumentTypeError, InvalidInputError."""
-    points = []
-    for text in texts:
-        x, y, z, *radius_m = read_numbers(text, 3 if text.count(",") == 2 else 4)
-        points.append(TargetPoint((x, y, z), *radius_m))
-    return tuple(points)
+    values = (read_numbers(text, 3 if text.count(",") < 3 else 4) for text in texts)
+    return tuple(TargetPoint((x, y, z), *radius_m) for x, y, z, *radius_m in values)
 
 
 def write_target_points(points: Sequence[TargetPoint]) -> list[str]:
