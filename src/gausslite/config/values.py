@@ -76,9 +76,7 @@ def read_target_points(texts: Sequence[str]) -> tuple[TargetPoint, ...]:
 
 def write_target_points(points: Sequence[TargetPoint]) -> list[str]:
     """Return the texts that `read_target_points` reads."""
-    return [
-        write_numbers(point.point_m if point.radius_m is None else (*point.point_m, point.radius_m)) for point in points
-    ]
+    return [write_numbers(p.point_m if p.radius_m is None else (*p.point_m, p.radius_m)) for p in points]
 
 
 def read_registration(text: str) -> DepthRegistration | None:
