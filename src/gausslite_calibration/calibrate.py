@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from gausslite.datasets.calibration import Calibration, FoundValue, StatedValues
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import Source, usable_frames
 from gausslite.domain.camera import CameraMotion
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
@@ -31,6 +31,7 @@ from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
 from gausslite_calibration.registered import RegisteredSource
 
 _NONE = "none"
+_TRIED_FRAMES = 8
 
 
 def calibrate(
@@ -42,6 +43,7 @@ def calibrate(
     that contradict the images, PoseError, InvalidInputError.
     """
     stated = stated or StatedValues()
+    _require_readable(source)
     contradiction = None if stated.checked else _contradiction(source, stated.force)
     if contradiction is not None and not contradiction.is_small:
         correction, prior = stated.correction, stated.pose_prior
@@ -115,6 +117,13 @@ def live_frame(frame: Frame, lens: Lens | None) -> Frame:
         return frame
     ideal = ideal_camera(frame.camera, CameraCorrection(lens), 0.0)
     return undistort_frame(frame, correction, ideal, motion.twist)
+
+
+def _require_readable(source: Source) -> None:
+    """Raise the error of the first frame if none of some can be read: the estimates would name other reasons."""
+    positions = range(0, len(source), max(1, len(source) // _TRIED_FRAMES))
+    if len(source) and next(usable_frames(source, positions), None) is None:
+        source.frame(0)
 
 
 def _contradiction(source: Source, force: bool) -> Contradiction | None:

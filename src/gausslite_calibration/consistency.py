@@ -24,7 +24,7 @@ from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.corrected import CorrectedSource
-from gausslite_calibration.depth_consistency import find_other_depth
+from gausslite_calibration.depth_consistency import DepthPair, find_other_depth
 from gausslite_calibration.rig_fit import REGISTERED, UNREGISTERED, PointMotion, fit_intrinsics, fit_mount
 from gausslite_poses.features import RelativePose, detect_features, relative_pose
 
@@ -100,6 +100,9 @@ class _Pair:
         # the larger of the stated and the found translation must move the points
         shift_px = max(1.0, abs(found)) * self.camera.angle_px(math.sqrt(information / len(turned)))
         return found if shift_px >= _MIN_MOTION * self.camera.width_px else math.nan
+
+
+_AnyPairs = Sequence[_Pair] | Sequence[DepthPair]
 
 
 def _median_distance(a: Float64[ndarray, "h n 2"], b: Float64[ndarray, "n 2"]) -> Float64[ndarray, " h"]:
@@ -215,11 +218,15 @@ def _find_in_depth(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair
         stated, late = _errors(readings, pairs) if pairs else (np.inf, np.inf)
         return bool(late <= stated)
 
-    found = find_other_depth(source, trajectory, poses_are_late)
+    def other_poses(pairs: Sequence[DepthPair]) -> Iterator[tuple[str, Float64[ndarray, "p 4 4"]]]:
+        return ((reading.words, reading.motions) for reading in _readings(trajectory, pairs))
+
+    found = find_other_depth(source, trajectory, poses_are_late, other_poses)
     if found is None:
         return None
     return Contradiction(
         f"depth images do not fit each other by the stated poses; {found.words} would agree",
+        only_unit=found.only_unit,
         is_small=abs(found.lag) == 1,
     )
 
@@ -336,7 +343,9 @@ def match_pair(images: Source, first: int, second: int) -> _Pair | None:
     return None if matched is None else _Pair(first, second, matched, reference.camera)
 
 
-def _motions(T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair]) -> Float64[ndarray, "p 4 4"]:
+def _motions(
+    T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair | DepthPair]
+) -> Float64[ndarray, "p 4 4"]:
     """Return T_second_first of each pair."""
     first = T_world_camera[[pair.first for pair in pairs]].reshape(-1, 4, 4)
     second = T_world_camera[[pair.second for pair in pairs]].reshape(-1, 4, 4)
@@ -344,7 +353,7 @@ def _motions(T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair]) 
     return motions
 
 
-def _readings(trajectory: Trajectory, pairs: Sequence[_Pair]) -> Iterator[_Reading]:
+def _readings(trajectory: Trajectory, pairs: _AnyPairs) -> Iterator[_Reading]:
     """Yield the ways to read the poses, the most common ones first."""
     stated = trajectory.T_world_camera
     involved = sorted({position for pair in pairs for position in (pair.first, pair.second)})
@@ -393,7 +402,7 @@ def _axes() -> list[tuple[str, Float64[ndarray, "4 4"]]]:
     return list(found.items())
 
 
-def _other_clocks(trajectory: Trajectory, pairs: Sequence[_Pair]) -> Iterator[_Reading]:
+def _other_clocks(trajectory: Trajectory, pairs: _AnyPairs) -> Iterator[_Reading]:
     """Yield the poses of other times: of each frame's time plus a shift."""
     times_s, T_world_camera = trajectory.times_s, trajectory.T_world_camera
     step_s = max(float(np.median(np.diff(times_s))), 1e-3)

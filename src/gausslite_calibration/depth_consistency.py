@@ -6,7 +6,7 @@ within a few per cent. Images of depth alone decide, so that neither features no
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -31,6 +31,10 @@ most 0.67 times, from one frame of lag on."""
 _RANDOM_ERROR = 0.85
 """Median disagreement of neighbours that no surface explains, as with bytes in another order."""
 _NO_READING = "no other reading of them"
+_AGREES, _FAR_BETTER = 0.6, 0.75
+"""Where few frames have features in common, a reading of the poses needs this mean disagreement of neighbours, and this
+share of the next best one's: right ones of five frames, far apart, have 0.45 and at most 0.69."""
+_UNITS = (5.0, 10.0, 1000.0)
 _MAX_LAG, _MAX_LAG_S = 15, 3.0
 
 
@@ -53,19 +57,20 @@ _READINGS: Mapping[str, Callable[[DepthImage, Camera], DepthImage]] = {
 
 @dataclass(frozen=True, slots=True)
 class DepthReading:
-    """Another reading of depth, in words. lag: each depth image belongs to the colour image so many frames before."""
+    """Another reading of depth or poses, in words. lag: depth images belong to the colour so many frames before."""
 
     words: str
     lag: int = 0
+    only_unit: bool = False
 
 
 def find_other_depth(
-    source: Source, trajectory: Trajectory, poses_are_late: Callable[[int], bool]
+    source: Source, trajectory: Trajectory, poses_are_late: Callable[[int], bool], other_poses: OtherPoses
 ) -> DepthReading | None:
     """Return the reading of depth images with which they agree far better than as stated; None without one.
 
-    poses_are_late: whether colour images, too, fit the poses of so many frames before. Frames that cannot be read are
-    ignored.
+    poses_are_late: whether colour images, too, fit the poses of so many frames before. other_poses: ways to read the
+    poses, for recordings that the stated ones fit nowhere. Frames that cannot be read are ignored.
     """
     T, tried = trajectory.T_world_camera, list(_farthest_pairs(source, trajectory))
     pairs = [pair for pair in tried if pair.disagreement(pair.motion(T))[1] >= _LEAST_OVERLAP]
@@ -73,7 +78,7 @@ def find_other_depth(
         nearest = np.array([pair.disagreement(pair.motion(T))[0] for pair in tried])
         judged = nearest[np.isfinite(nearest)]
         is_random = len(judged) >= _MIN_PAIRS and float(np.median(judged)) > _RANDOM_ERROR
-        return DepthReading(_NO_READING) if is_random else None
+        return _agreeing(tried, T, other_poses) if is_random else None
     stated = np.array([pair.disagreement(pair.motion(T))[0] for pair in pairs])
     if float(stated.mean()) < _LEAST_ERROR:
         return None
@@ -92,6 +97,27 @@ def find_other_depth(
     return None if found[best] > _GAIN or (best.lag and poses_are_late(best.lag)) else best
 
 
+def _agreeing(pairs: Sequence[DepthPair], T: Float64[ndarray, "n 4 4"], other_poses: OtherPoses) -> DepthReading:
+    """Return the reading of the poses, or unit of depth, by which neighbours agree far better than by any other."""
+    errors = {DepthReading(words): _mean_error(pairs, motions) for words, motions in other_poses(pairs)}
+    for factor in (*_UNITS, *(1.0 / unit for unit in _UNITS)):
+        # shorter ways of the camera are as good as depth multiplied
+        scaled = T.copy()
+        scaled[:, :3, 3] /= factor
+        change, number = ("multiplied", factor) if factor > 1.0 else ("divided", 1.0 / factor)
+        reading = DepthReading(f"depth {change} by {number:g} (the unit of depth is another one)", only_unit=True)
+        errors[reading] = _mean_error(pairs, [pair.motion(scaled) for pair in pairs])
+    best, second = sorted(errors, key=errors.__getitem__)[:2]
+    return best if errors[best] <= min(_AGREES, _FAR_BETTER * errors[second]) else DepthReading(_NO_READING)
+
+
+def _mean_error(pairs: Sequence[DepthPair], motions: Iterable[Float64[ndarray, "4 4"] | None]) -> float:
+    """Return the mean disagreement; infinite if few pairs can be judged."""
+    errors = np.array([pair.disagreement(motion)[0] for pair, motion in zip(pairs, motions, strict=True)])
+    judged = errors[np.isfinite(errors)]
+    return float(judged.mean()) if len(judged) >= _MIN_PAIRS else np.inf
+
+
 def _relative_error(stated: Float64[ndarray, " p"], found: Sequence[tuple[float, float]]) -> float:
     """Return the mean of the errors relative to the stated ones; infinite for few pairs, or if some do not gain."""
     values = np.array([error for error, _ in found])
@@ -102,7 +128,7 @@ def _relative_error(stated: Float64[ndarray, " p"], found: Sequence[tuple[float,
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _DepthPair:
+class DepthPair:
     """The depth images at two positions."""
 
     first: int
@@ -119,7 +145,7 @@ class _DepthPair:
         motion: Float64[ndarray, "4 4"] = inverse(T_world_camera[second]) @ T_world_camera[first]
         return motion
 
-    def read_by(self, read: Callable[[DepthImage, Camera], DepthImage]) -> _DepthPair:
+    def read_by(self, read: Callable[[DepthImage, Camera], DepthImage]) -> DepthPair:
         """Return the pair with its images read in another way."""
         return replace(self, first_m=read(self.first_m, self.camera), second_m=read(self.second_m, self.camera))
 
@@ -148,7 +174,11 @@ class _DepthPair:
         return float(np.minimum(error / _FULL_ERROR, 1.0).mean()), float(np.sum(error < _SAME_SURFACE)) / len(z_m)
 
 
-def _farthest_pairs(source: Source, trajectory: Trajectory) -> Iterator[_DepthPair]:
+OtherPoses = Callable[[Sequence[DepthPair]], Iterable[tuple[str, Float64[ndarray, "p 4 4"]]]]
+"""Yields words and T_second_first of each pair."""
+
+
+def _farthest_pairs(source: Source, trajectory: Trajectory) -> Iterator[DepthPair]:
     """Yield pairs spread over the source, each as far apart as the frames show the same surfaces, else neighbours."""
     count, size, gap = len(source), capped_size(source.camera), 2
     for first in sorted({round(position) for position in np.linspace(0, count - 1, _MAX_PAIRS)}):
@@ -158,7 +188,7 @@ def _farthest_pairs(source: Source, trajectory: Trajectory) -> Iterator[_DepthPa
             while gap >= 1:
                 second = first + direction * gap
                 other_m = source.frame(second, size).depth_m
-                pair = _DepthPair(first, second, frame.camera, frame.depth_m, other_m)
+                pair = DepthPair(first, second, frame.camera, frame.depth_m, other_m)
                 if gap == 1 or pair.disagreement(pair.motion(trajectory.T_world_camera))[1] >= _LEAST_OVERLAP:
                     yield pair
                     break

@@ -16,6 +16,7 @@ from numpy import ndarray
 from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
+from gausslite.datasets.folder import up_note
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of, twist_of
@@ -231,6 +232,9 @@ def _floor_grid(content: MapContent, settings: ExportSettings) -> FloorGrid:
     plane = " + ".join(f"{value} {axis}" for value, axis in zip(normal, "xyz", strict=True) if value)
     turned = "" if normal == [0, 0, 1] else "; the grid is turned: p_map = T_map_grid p_grid, which the file has"
     print_message(f"the floor is where {plane} = {height_m} m in the map's frame, that of objects and areas{turned}")
+    poses = np.array([view.T_world_camera for view in content.views]).reshape(-1, 4, 4)
+    if not turned and (note := up_note(poses, (0.0, 0.0, 1.0))):
+        print_message(f"the grid may be a vertical slice: {note} for `map`")
     return grid
 
 

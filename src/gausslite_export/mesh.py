@@ -49,7 +49,9 @@ class TsdfVolume:
     def __post_init__(self) -> None:
         count = math.prod(self.shape)
         if count > _MAX_VOXELS:
-            raise InvalidInputError(f"mesh: expected at most {_MAX_VOXELS} voxels, got {count}; use a larger --voxel")
+            enough_m = math.ceil(1050 * self.voxel_m * math.cbrt(count / _MAX_VOXELS)) / 1000
+            expected = f"expected at most {_MAX_VOXELS} voxels, got {count}"
+            raise InvalidInputError(f"mesh: {expected}; use a larger --voxel, such as {enough_m:g}")
         self.distances = np.ones(count, np.float32)
         self.weights = np.zeros(count, np.float32)
         self.colours = np.zeros((count, 3), np.float32)

@@ -144,7 +144,7 @@ class ServerPlace:
     """A fusion server: each call sees its objects of now; the map is fetched again when its revision has changed."""
 
     def __init__(self, address: str, tls: Tls | None = None, threads: int | None = None) -> None:
-        require_callable("a fusion server or the output folder of a run", address)
+        require_callable("no such folder; a fusion server", address)
         self.name, self._tls, self._threads = address, tls, threads
         self._lock, self._revision = RLock(), -1
         self._scene: Scene | None = None

@@ -42,10 +42,8 @@ def run(options: argparse.Namespace) -> int:
     """Edit, and print what was done. Returns the exit code."""
     memory = open_memory(options.place, build(TlsFiles, options).read())
     if options.kind == _LIST:
-        for entry in memory.edits():
-            print(entry.describe())
-        for area in memory.areas():
-            print(_describe(area))
+        lines = [*(entry.describe() for entry in memory.edits()), *map(_describe, memory.areas())]
+        print("\n".join(lines) or "no edits and no areas")
     elif options.kind == _AREA:
         area = Area(options.object, tuple(map(_corner, options.values)))
         memory.set_area(area)

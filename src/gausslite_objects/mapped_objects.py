@@ -50,7 +50,7 @@ def query(address: str, tls: Tls | None) -> MappedObjects:
     from gausslite.wire.clients import FusionClient
     from gausslite_objects.memory_client import ServerMemory
 
-    require_callable("a fusion server or the output folder of a run", address)
+    require_callable("no such folder; a fusion server", address)
     with FusionClient(address, tls=tls) as client:
         left_out = client.unlocalised()
         notes = tuple(f"the objects of {agent_id} are left out; {reason}" for agent_id, reason in left_out.items())
@@ -90,7 +90,7 @@ def open_memory(place: str, tls: Tls | None = None) -> ObjectMemory:
     from gausslite.wire.channel import require_callable
     from gausslite_objects.memory_client import ServerMemory
 
-    require_callable("a fusion server, an agent or the output folder of a run", place)
+    require_callable("no such folder; a fusion server or an agent", place)
     return ServerMemory(place, tls)
 
 

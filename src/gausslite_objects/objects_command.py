@@ -64,7 +64,7 @@ def _count(count: int, question: str, known: Sequence[TeamObject]) -> str:
     if count:
         return f"{count} object{'s' if count > 1 else ''}"
     nouns = sorted({team_object.landmark.noun for team_object in known})[:_MAX_LISTED]
-    has = f"; the map has {', '.join(nouns)}" if nouns else ""
+    has = "; the map has " + (", ".join(nouns) or "none: two moments or places confirm an object")
     return f"no object{f' for {quote_name(question)}' if question else ''}{has}"
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gausslite.datasets.camera_files import FolderCamera, lens_of
+from gausslite.datasets.camera_files import FolderCamera, lens_of, read_matrix
 from gausslite.datasets.files import is_number, parse_numbers, read_rows, read_text
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
@@ -142,9 +142,21 @@ def read_orb_slam(path: Path, width_px: int, height_px: int) -> FolderCamera | N
     return FolderCamera(camera.resized(width_px, height_px), units, lens)
 
 
+def read_other_matrix(path: Path, width_px: int, height_px: int) -> FolderCamera | None:
+    """Return the camera of a 3x3 matrix, of colour, under another name; None for other texts."""
+    if "depth" in path.name.lower():
+        return None
+    try:
+        camera = read_matrix(path).camera(str(path), width_px, height_px)
+    except DatasetError:
+        return None
+    return FolderCamera(camera, note=f"the camera is the matrix of {path.name}")
+
+
 COLMAP: Final = FormatReader(("cameras.txt",), read_colmap)
 SENSOR_INFO: Final = FormatReader(("info.txt", "_info.txt"), read_sensor_info)
 OPEN3D: Final = FormatReader(("*intrinsic*.json", "camera_primesense.json", "camera.json"), read_open3d)
 ETH3D: Final = FormatReader(("calibration.txt",), read_eth3d)
 ORB_SLAM: Final = FormatReader(("*.yaml", "*.yml"), read_orb_slam)
+MATRIX: Final = FormatReader(("*ntrinsic*.txt", "*K.txt"), read_other_matrix)
 """The readers of the group `gausslite.cameras`."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tum_recording import write_home
 
 import gausslite as gl
 from gausslite.cli.main import main
@@ -105,3 +106,15 @@ def test_a_real_clip_gets_all_three_estimates(
     assert sequence.source.depth_registered
     assert sequence.pose_prior.has_pose_error
     assert [note.split()[0] for note in sequence.notes] == ["register-depth", "camera-correction", "pose-prior"]
+
+
+def test_a_recording_without_a_readable_frame_is_refused_before_anything_is_estimated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_home(tmp_path / "walk")
+    for path in folder.glob("depth-*.png"):
+        path.write_bytes(b"P5 64 48 65535\n" + bytes(64 * 48 * 2))
+    assert main(["map", str(folder), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "expected a PNG or JPEG image, got another format, which begins with b'P5" in said
+    assert "pose-prior none" not in said

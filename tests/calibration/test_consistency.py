@@ -220,6 +220,22 @@ def test_mirrored_depth_images_are_named(recording: Recording) -> None:
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+FEW: dict[str, tuple[Callable[[Poses], Poses], float, str]] = {
+    "inverse": (np.linalg.inv, 1.0, "poses read as world-to-camera poses would agree"),
+    "quaternion": (CONVENTIONS["quaternion"][0], 1.0, "quaternions with w first would agree"),
+    "unit": (lambda poses: poses, 0.2, "depth multiplied by 5 "),
+}
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_few_frames_far_apart_name_what_would_agree(home: Source, name: str) -> None:
+    recording = Recording(home, [20, 27, 34, 41, 48])
+    assert find_contradiction(recording) is None
+    change, recording.depth_factor, words = FEW[name]
+    recording.poses = change(recording.poses)
+    pytest.raises(DatasetError, calibrate, recording, NOTHING_ESTIMATED).match(words)
+
+
 @pytest.mark.slow
 def test_depth_images_with_swapped_bytes_are_refused(recording: Recording) -> None:
     swapped = [np.round(1000 * frame.depth_m).astype(np.uint16).byteswap() / 1000 for frame in recording.frames]

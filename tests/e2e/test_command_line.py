@@ -157,6 +157,7 @@ def test_every_wrong_input_gives_one_line_and_exit_code_two(tmp_path: Path, mug_
         "size: expected": ("map", HOME, *task, "--size", "9" * 5000 + "x10", *out),
         "frames '99": ("map", HOME, *task, "--frames", "9" * 5000 + ":", *out),
         "ball": ("map", HOME, "--set", "target-at=0,0,0,1e300", *out),
+        "expected 3 finite numbers": ("map", HOME, "--set", "target-at=abc", *out),
         "UTF-8": ("parse", "find the m\udcffg"),
         "refine-iterations": ("demo", "--set", "refine-iterations=1000000", *out),
         "a-file": ("map", HOME, *task, "--out", tmp_path / "a-file"),

@@ -12,7 +12,7 @@ import yaml
 
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
-from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import inverse, transform_of, transform_points
 from gausslite.mapping.free_space import DepthView
 from gausslite.plugins import Group, load
@@ -104,7 +104,17 @@ def test_distances_to_obstacles_have_the_pose_of_their_grid(tmp_path, capsys):
     np.testing.assert_allclose(transform_points(inverse(T_map_upright), in_map_m), (1.25, 1.25, 0.0), atol=0.11)
     assert float(floor[1]) * in_map_m[0] == pytest.approx(float(floor[2]), abs=2e-3)
     export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=VIEWS))
-    assert "the floor is where 1.0 z = " in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the floor is where 1.0 z = " in said
+    assert "slice" not in said
+
+
+def test_a_grid_of_a_world_whose_up_is_not_stated_is_doubted(tmp_path, capsys):
+    T_camera_world = inverse(VIEWS[0].T_world_camera)
+    gaussians = move_gaussians(room(), T_camera_world)
+    views = [dataclasses.replace(view, T_world_camera=T_camera_world @ view.T_world_camera) for view in VIEWS]
+    export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=views))
+    assert "a vertical slice: the images show up as 0,-1,0, the layout as 0,0,1" in capsys.readouterr().err
 
 
 def test_a_thin_surface_stays_where_most_images_see_past_it_and_one_error_is_none():

@@ -71,6 +71,6 @@ def test_mesh_needs_views_and_a_bounded_grid(tmp_path):
     gaussians = plane()
     with pytest.raises(InvalidInputError, match=r"keyframes\.json"):
         write_mesh(tmp_path / "m.ply", gaussians, [], view_map(gaussians).render, VOXEL_M)
-    with pytest.raises(InvalidInputError, match="--voxel"):
+    with pytest.raises(InvalidInputError, match=r"--voxel, such as 0\.00\d"):
         write_mesh(tmp_path / "m.ply", gaussians, views_from_above(), view_map(gaussians).render, 0.0004)
     assert not list(tmp_path.iterdir())

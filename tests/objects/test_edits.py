@@ -51,6 +51,8 @@ def test_of_two_objects_in_one_place_the_one_of_the_id_is_edited(run: Path) -> N
 
 
 def test_a_renamed_object_has_its_new_name_for_later_edits(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["edit", str(run), "list"]) == 0
+    assert capsys.readouterr().out == "no edits and no areas\n"
     _edit(run, "rename", FOUND.object_id, "cup")
     _edit(run, "note", FOUND.object_id, "the blue one")
     capsys.readouterr()

@@ -30,6 +30,9 @@ def test_a_question_lists_and_counts_the_objects(run: Path, capsys: pytest.Captu
     assert capsys.readouterr().out == (
         "note: the map has no 'shelf'\nno object for 'what is on the shelf'; the map has mug, table\n"
     )
+    empty = write_run(run.parent / "empty", objects=[])
+    assert main(["objects", str(empty)]) == 1
+    assert capsys.readouterr().out == "no object; the map has none: two moments or places confirm an object\n"
     assert main(["objects", str(run), "?!"]) == 2
     assert "QUESTION" in capsys.readouterr().err
 

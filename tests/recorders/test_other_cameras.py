@@ -32,6 +32,8 @@ WHOLE = Camera(20, 22, 8, 6, 16, 12)
         ("info.txt", SENSOR, 5000, None),
         ("intrinsic.json", OPEN3D, None, None),
         ("calibration.txt", "20 22 7.5 5.5\n", None, None),
+        ("intrinsics.K.txt", "20 0 7.5\n0 22 5.5\n0 0 1\n", None, None),
+        ("K.txt", "20,0,7.5\n0,22,5.5\n0,0,1", None, None),
         ("TUM1.yaml", ORB_SLAM, 5000, Lens(LensModel.RADTAN, (0.1, 0.0, 0.0, 0.0, 0.0))),
     ],
 )
@@ -56,7 +58,8 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str, text: str) -> None:
 
 
 def test_other_texts_are_no_cameras(tmp_path: Path) -> None:
-    for name in ("info.txt", "calibration.txt", "notes.yaml"):
+    (tmp_path / "depth_intrinsics.txt").write_text("20 0 7.5\n0 22 5.5\n0 0 1\n")
+    for name in ("info.txt", "calibration.txt", "notes.yaml", "intrinsics.txt"):
         (tmp_path / name).write_text("a: walk through the kitchen\n")
     assert read_folder_camera(tmp_path, 16, 12) is None
 

@@ -330,8 +330,8 @@ class AgentMission:
             ended_by = ended_by or _INTERRUPTED
         gaussians = self._worker.run(lambda mapper: mapper.gaussians()).result()
         status, uplink = self._worker.status(), self._worker.uplink
-        for note in status.task_notes:
-            _log.warning("%s", note)
+        for note in (*status.noun_notes, *status.task_notes):
+            _log.log(logging.INFO if note in status.noun_notes else logging.WARNING, "%s", note)
         counters = None if uplink is None else uplink.counters()
         if self._settings.out is not None and status.mapped > 0:
             self._write_results(self._settings.out, gaussians, counters or UplinkCounters(), ended_by)

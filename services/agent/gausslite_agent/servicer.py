@@ -136,10 +136,11 @@ class NewestTask:
             self._newest.cancel()
         self._newest = future
         assigned = asyncio.wrap_future(future)
+        # asyncio logs an error that nobody looks at, as where the caller has gone
+        assigned.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.wait([assigned])
         if future.cancelled():
             raise MismatchError("task: superseded by a newer AssignTask before it was assigned")
-        # else asyncio logs the error of a refused task as one that nobody has looked at
         return assigned.result()
 
 

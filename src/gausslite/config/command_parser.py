@@ -66,7 +66,7 @@ class CommandParser(argparse.ArgumentParser):
     def refuse_unknown(self, unknown: Sequence[str]) -> NoReturn:
         """End the process with a line about the arguments that argparse does not know."""
         flag = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
-        similar = "" if flag is None else suggestion(flag, self.flags)
+        similar = "; arguments stand before the options" if flag is None else suggestion(flag, self.flags)
         self.error(f"unrecognized arguments: {' '.join(unknown)}{similar}")
 
 

@@ -70,18 +70,13 @@ def write_numbers(values: Sequence[float]) -> str:
 
 def read_target_points(texts: Sequence[str]) -> tuple[TargetPoint, ...]:
     """Return the points of "x,y,z" or "x,y,z,r", in metres. Raises ArgumentTypeError, InvalidInputError."""
-    points = []
-    for text in texts:
-        x, y, z, *radius_m = read_numbers(text, 3 if text.count(",") == 2 else 4)
-        points.append(TargetPoint((x, y, z), *radius_m))
-    return tuple(points)
+    values = (read_numbers(text, 3 if text.count(",") < 3 else 4) for text in texts)
+    return tuple(TargetPoint((x, y, z), *radius_m) for x, y, z, *radius_m in values)
 
 
 def write_target_points(points: Sequence[TargetPoint]) -> list[str]:
     """Return the texts that `read_target_points` reads."""
-    return [
-        write_numbers(point.point_m if point.radius_m is None else (*point.point_m, point.radius_m)) for point in points
-    ]
+    return [write_numbers(p.point_m if p.radius_m is None else (*p.point_m, p.radius_m)) for p in points]
 
 
 def read_registration(text: str) -> DepthRegistration | None:

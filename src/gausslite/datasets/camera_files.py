@@ -89,7 +89,7 @@ def read_folder_camera(
         if path.is_file():
             found = read_camera_file(path, width_px, height_px)
             if (found.camera.width_px, found.camera.height_px) == (width_px, height_px):
-                return replace(found, note=f"the camera is that of {path}, one folder above; expected it in the folder")
+                return replace(found, note=f"the camera is that of {path}, one folder above the images")
     return None
 
 

@@ -18,12 +18,12 @@ from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.lens import Lens
-from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.relevance import Region
 
 FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 """Upward direction of a world that a level first view defines."""
-_LEVEL_COSINE = 0.8
+_LEVEL_COSINE, _AT_CEILING = 0.8, 0.7
 """Cameras without roll show up within about 20 degrees; rarely level ones within 37."""
 _ORIGIN_STEP_M = 10_000.0
 _EARTH_DIAMETER_M = 1.3e7
@@ -52,9 +52,12 @@ def estimate_up(
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
-def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) -> str:
+def up_note(T_world_camera: Float64[ndarray, "n 4 4"], up_axis: UpAxis) -> str:
     """Return the message on images that show another upward direction than this one; empty if they agree."""
-    shown = np.array(estimate_up(rotations_world_camera, up_axis))
+    shown = np.array(estimate_up(T_world_camera[:, :3, :3], up_axis))
+    # few views span no plane; but none looks at the ceiling all the time
+    if T_world_camera[:, :3, 2].sum(axis=0) @ up_axis > _AT_CEILING * len(T_world_camera):
+        shown = np.array(upward_axis(T_world_camera))
     if shown @ up_axis > _LEVEL_COSINE:
         return ""
     stated, found = (",".join(f"{value + 0.0:.2g}" for value in np.round(axis, 2)) for axis in (up_axis, shown))

@@ -236,9 +236,9 @@ def select_frames(source: Source, selection: str) -> list[int]:
 
 
 def numbering_note(source: Source, selection: str) -> str:
-    """Return the message that a selection chooses among numbers with gaps; empty if all are chosen, or without gaps."""
+    """Return the message that a selection is by numbers; empty if all are chosen, or if they are positions too."""
     numbers, count = source.indices(), len(select_frames(source, selection))
-    if count == len(numbers) or numbers[-1] - numbers[0] == len(numbers) - 1:
+    if count == len(numbers) or numbers[-1] == len(numbers) - 1:
         return ""
     return (
         f"frames {selection}: {count} of {len(numbers)} are chosen by their numbers, which are "

@@ -141,7 +141,7 @@ WRONG_FLAGS = {
     ("--no-verbose",): "--no-verbose: write --set verbose=false",
     ("--max-item", "5"): "unrecognized arguments: --max-item 5; did you mean --max-items?",
     ("--sped=fast",): "unrecognized arguments: --sped=fast; did you mean --speed?",
-    ("more",): "unrecognized arguments: more",
+    ("more",): "unrecognized arguments: more; arguments stand before the options",
 }
 
 

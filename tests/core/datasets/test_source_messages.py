@@ -77,7 +77,7 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
     rows = (folder / "depth.txt").read_text().splitlines()
     (folder / "depth.txt").write_text("\n".join(rows[:3]))
     open_recorded(str(folder), None)
-    _camera, line = capsys.readouterr().err.splitlines()
+    _camera, line, _up = capsys.readouterr().err.splitlines()
     reason = "without poses around them at most 1 s apart, or depth within 20 ms"
     assert line == f"{folder}: 1 of 4 colour images are skipped: {reason}"
 
@@ -108,12 +108,13 @@ def test_a_folder_without_poses_is_refused_with_the_option_that_tracks_them(
     assert "--poses track" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("turn_rad", [1.2, 0.1])
 def test_images_that_show_another_upward_direction_are_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], turn_rad: float
 ) -> None:
     folder = write_tum(tmp_path / "fr1", frames=60)
     # the first camera is the world, as in the trajectories of ORB-SLAM: y points down
-    yaws = np.linspace(-1.2, 1.2, 300) / 2
+    yaws = np.linspace(-turn_rad, turn_rad, 300) / 2
     rows = [f"{9.9 + i / 100:.3f} 0 0 0 0 {np.sin(a):.9f} 0 {np.cos(a):.9f}" for i, a in enumerate(yaws)]
     (folder / "groundtruth.txt").write_text("\n".join(rows))
     assert open_recorded(str(folder), None).up_axis == (0.0, 0.0, 1.0)

@@ -193,6 +193,28 @@ def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() 
     assert refused.details() == "task: superseded by a newer AssignTask before it was assigned"
 
 
+def test_the_error_of_a_task_whose_caller_has_gone_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:
+    begun, gone = threading.Event(), threading.Event()
+
+    def refuse() -> TaskGraph:
+        begun.set()
+        assert gone.wait(20)
+        raise MismatchError("late")
+
+    async def call() -> None:
+        newest = NewestTask()
+        calling = asyncio.create_task(newest.assign(refuse))
+        await asyncio.to_thread(begun.wait, 20)
+        calling.cancel()
+        gone.set()
+        await asyncio.wait([calling])
+        await newest.assign(lambda: TaskGraph("", "", (), (), ()))
+        gc.collect()
+
+    asyncio.run(call())
+    assert "never retrieved" not in caplog.text
+
+
 def test_each_frame_has_its_outcome_in_order(robot: Agent) -> None:
     dark = Frame(1, 1, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32), CAMERA, np.eye(4))
     requests = [
