@@ -23,8 +23,7 @@ from gausslite_sim.odometry_drift import drifting_poses
 
 _HOME_COUNT, _HOME_M = 8, 10.0
 """Different homes; the next ones are the same with other objects and textures. Each is less than 7 m wide."""
-_HELD_OUT, _VIEWS = 2, 16
-CORRIDOR_FRAMES = 12
+_HELD_OUT, _VIEWS, CORRIDOR_FRAMES = 2, 16, 12
 _CORRIDOR_M, _EYE_M, _STEP_M, _TILE_M = (8.0, 2.0, 2.5), (0.5, 1.0, 1.4), 0.5, 0.25
 _BELOW_M = 8.0
 """The corridors are below the homes, so that no camera sees through the walls of both."""
@@ -69,8 +68,8 @@ def record(path: str, home: int, width: int, frames: int, trajectory: int = 0) -
     """Write frames of a home, or of the corridor behind it for 0, in a process whose memory is not measured."""
     recorded = _home_frames(home, trajectory, frames, width) if frames else corridor_frames(home, width)
     names = "rgb", "depth_m", "T_world_camera"
-    images = {name: np.stack([getattr(frame, name) for frame in recorded]) for name in names}
-    np.savez(path, **images, focal_px=recorded[0].camera.fx_px)
+    rgb, depth_m, poses = (np.stack([getattr(frame, name) for frame in recorded]) for name in names)
+    np.savez(path, rgb=rgb, depth_m=depth_m, T_world_camera=poses, focal_px=recorded[0].camera.fx_px)
 
 
 @dataclass(frozen=True, slots=True)
