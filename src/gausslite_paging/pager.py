@@ -15,6 +15,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import MapFileError
@@ -46,11 +47,21 @@ _REACH_PER_SCALE = 5.0
 _REACH_MARGIN = 1.1
 _DEPTH_STEP_PX = 4
 _PART_NUMBERS = 8
+_MAX_CORRECTIONS = 32
+"""By loops that wait for what is on disk: of an hour's map each takes 200 kB, and widens the bounds of all parts."""
 
 
 def _row_type(table: SplatTable) -> np.dtype[np.void]:
     """Return the type of a packed row with all columns of a table."""
     return np.dtype([(name, column.dtype, column.shape[1:]) for name, column in table.state().items()])
+
+
+def _packed(table: SplatTable, rows: Int64[ndarray, " m"]) -> NDArray[np.void]:
+    """Return all columns of these rows."""
+    packed = np.empty(len(rows), _row_type(table))
+    for name, column in table.state().items():
+        packed[name] = column[rows]
+    return packed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,6 +153,11 @@ class DiskPager(MapPager):
         """Gaussians on disk."""
         return sum(part.count for part in self._parts)
 
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes on disk, with the images of keyframes."""
+        return self._file.size + self._images.size
+
     def show(self, table: SplatTable, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> None:
         """Load what a camera sees, as far as seeds may be."""
         if not self._parts:
@@ -204,7 +220,7 @@ class DiskPager(MapPager):
 
     def keep(self, keyframe: Keyframe) -> Keyframe:
         """Return a keyframe that does not train, with its images in a file while the disk has room."""
-        return self._images.keep(keyframe, self._max_bytes - self._file.size - self._images.size)
+        return self._images.keep(keyframe, self._max_bytes - self.stored_bytes)
 
     def with_stored(self, in_memory: Gaussians, use_ema: bool, active_only: bool, unsent_only: bool) -> Gaussians:
         """Return these Gaussians and a copy of those on disk, as they are when they return."""
@@ -228,6 +244,8 @@ class DiskPager(MapPager):
             self._corrections[self._corrected] = T_corrected_earlier.copy()
             self._parts = [part.moved(T_corrected_earlier) for part in self._parts]
         self._corrected += 1
+        if len(self._corrections) > _MAX_CORRECTIONS:
+            self._correct_oldest()
 
     def state(self) -> State:
         """Return the file, where its parts are, what happened since they were stored, and what the frames need."""
@@ -295,6 +313,27 @@ class DiskPager(MapPager):
             to[first:] = column
         self._file.release(part.page)
         self._parts.remove(part)
+        self._forget_corrections()
+
+    def _correct_oldest(self) -> None:
+        """Move the parts on disk that wait for the most corrections, if the disk has room for a copy of one."""
+        oldest = min(part.corrections for part in self._parts)
+        for i, part in enumerate(self._parts):
+            if part.corrections > oldest:
+                continue
+            table = self._read(part)
+            data = _packed(table, np.arange(part.count)).tobytes()
+            page = self._file.write(data, self._max_bytes - self._images.size)
+            if page is None:
+                break
+            self._file.release(part.page)
+            means_m = table.means_m.astype(np.float64)
+            reach_m = _REACH_PER_SCALE * np.exp(table.rows[:, LOG_SCALE].max())
+            bounds_m = np.stack([means_m.min(axis=0) - reach_m, means_m.max(axis=0) + reach_m])
+            self._parts[i] = _Part(part.tile, part.count, page, self._corrected, self._tasks, bounds_m, part.anchors)
+        self._forget_corrections()
+
+    def _forget_corrections(self) -> None:
         oldest = min((part.corrections for part in self._parts), default=self._corrected)
         self._corrections = {i: motions for i, motions in self._corrections.items() if i >= oldest}
 
@@ -346,9 +385,7 @@ class DiskPager(MapPager):
         self, table: SplatTable, rows: Int64[ndarray, " m"], tile: int, bounds_m: Float64[ndarray, "2 3"]
     ) -> bool:
         """Write the rows of a tile; return False if the disk has no room for them."""
-        packed = np.empty(len(rows), _row_type(table))
-        for name, column in table.state().items():
-            packed[name] = column[rows]
+        packed = _packed(table, rows)
         page = self._file.write(packed.tobytes(), self._max_bytes - self._images.size)
         if page is None:
             if not self._is_full:

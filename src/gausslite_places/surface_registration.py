@@ -18,6 +18,7 @@ from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import without_depth_edges
 from gausslite.domain.pose import orthonormal, transform_points
 from gausslite.process import import_extra
+from gausslite_places.matcher_process import MATCHER
 
 _NEIGHBOURS = 10
 _GICP_ITERATIONS = 30
@@ -129,7 +130,7 @@ def matched_motion(
     source: Surface, target: Surface, min_inliers: int = _MIN_MATCHER_INLIERS
 ) -> Float64[ndarray, "4 4"] | None:
     """Return T_target_source from matches of point features; None with too few samples, or consistent matches."""
-    kiss_matcher = import_extra("kiss_matcher", "slam", "registration without a guess")
+    import_extra("kiss_matcher", "slam", "registration without a guess")
     spacing_m = max(source.spacing_m, target.spacing_m)
     # features of points compare only at equal spacing
     source, target = (
@@ -139,14 +140,8 @@ def matched_motion(
     # kiss-matcher crashes on a few points
     if min(len(source), len(target)) < _MIN_SAMPLES:
         return None
-    config = kiss_matcher.KISSMatcherConfig(voxel_size=spacing_m, use_voxel_sampling=False)
-    matcher = kiss_matcher.KISSMatcher(config)
-    found = matcher.estimate(list(source.points_m.astype(np.float32)), list(target.points_m.astype(np.float32)))
-    if not found.valid or matcher.get_num_final_inliers() < min_inliers:
-        return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found.rotation, np.asarray(found.translation).ravel()
-    return orthonormal(T) if np.isfinite(T).all() else None
+    T = MATCHER(source.points_m, target.points_m, spacing_m, min_inliers)
+    return orthonormal(T) if T is not None and np.isfinite(T).all() else None
 
 
 def evaluate(source: Surface, target: Surface, T_target_source: Float64[ndarray, "4 4"]) -> Registration | None:

@@ -21,6 +21,7 @@ from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.seeding import RenderedView
 from gausslite.mission.localisation_monitor import Admission, LocalisationMonitor, LocalisationState
 from gausslite.mission.prior_map import PriorMap
+from gausslite.process import return_free_memory
 from gausslite_calibration.live_check import LiveCheck
 from gausslite_places.verification import verify
 from gausslite_relocalisation.agreement import Agreement, compare, is_another_place
@@ -69,6 +70,8 @@ class FrameMonitor(LocalisationMonitor):
         self._earlier: list[Frame] = []
         self._newest: Frame | None = None
         self._cause, self._is_continued = "", False
+        # whether a search, and perhaps a piece, ended with the frame before
+        self._has_searched = False
         # of the present doubt: its first frame; frames so far; the latest ones in a row that agree, or leave it open
         self._since = self._doubtful = self._agreed = self._open = 0
         # of the mission: frames that agreed, doubts, places that were found, pieces of map that were joined, or left
@@ -97,6 +100,10 @@ class FrameMonitor(LocalisationMonitor):
 
     def admit(self, frame: Frame, mapper: GaussianMapper) -> Admission:
         """Return which frames are to be mapped now; see `LocalisationMonitor.admit`."""
+        if self._has_searched:
+            # 100 MB for the search and a piece, in holes that the process would keep
+            return_free_memory()
+            self._has_searched = False
         self._newest = frame
         self._earlier = [view.keyframe.frame for view in mapper.store.window[-_EARLIER:]]
         doubt = self._steps.add(frame)
@@ -254,7 +261,7 @@ class FrameMonitor(LocalisationMonitor):
         frames = (*self._waiting, frame)
         self._recovered = {waited.id for waited in frames}
         self._waiting.clear()
-        self._search = None
+        self._has_searched, self._search = self._search is not None, None
         self._steps.begin(is_followed=True)
         self._found += T_map_odometry is not None
         self._localisation = LocalisationState.TRACKED

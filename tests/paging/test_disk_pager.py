@@ -120,17 +120,17 @@ def test_a_new_task_and_its_keyframes_reach_what_is_on_disk() -> None:
         assert sorted_bytes(paged.gaussians()) == sorted_bytes(whole.gaussians()), frame.index
 
 
-class _MovesOnce:
-    """Moves all keyframes at one of them, those of each room in its own way."""
+class _Moves:
+    """Moves all keyframes at some of them, those of each room in its own way."""
 
     counts = LoopCounts()
 
-    def __init__(self) -> None:
-        self.keyframes = 0
+    def __init__(self, at: Sequence[int]) -> None:
+        self.keyframes, self._at = 0, at
 
     def add(self, keyframe: Keyframe, prior: Frame, kept: Sequence[Keyframe], table: SplatTable) -> np.ndarray | None:
         self.keyframes += 1
-        if self.keyframes != AWAY // 2 - 1:
+        if self.keyframes not in self._at:
             return None
         steps = np.arange(self.keyframes)[:, None] * np.array([0.01, 0.0, 0.005, 0.0, 0.001, 0.0])
         return np.array([transform_of(step) for step in steps])
@@ -142,11 +142,14 @@ class _MovesOnce:
         pass
 
 
-def test_a_correction_moves_what_is_on_disk_with_its_anchors() -> None:
-    paged, whole = rooms_mapper(disk_pager(), _MovesOnce()), rooms_mapper(None, _MovesOnce(), 20 * CAP)
+@pytest.mark.parametrize("at", [[AWAY // 2 - 1], range(8, AWAY // 2)])
+def test_corrections_move_what_is_on_disk_with_its_anchors(at: Sequence[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gausslite_paging.pager._MAX_CORRECTIONS", 2)
+    paged, whole = rooms_mapper(disk_pager(), _Moves(at)), rooms_mapper(None, _Moves(at), 20 * CAP)
     missions = rooms_mission(paged), rooms_mission(whole)
     # the server learns when a tile returns that it has moved
     assert max(assert_same_tour(missions, tour_frames(0, AWAY), publishes=False)) > 400
+    assert len(paged.pager._corrections) <= 2
     paged.render(room_frame(0).camera, np.eye(4))
     assert not paged.pager.holds(first_room_keys(whole)).any()
     assert sorted_bytes(paged.gaussians()) == sorted_bytes(whole.gaussians())

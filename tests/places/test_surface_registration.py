@@ -6,7 +6,15 @@ from place_scenes import MapCamera, looking, room
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points, translation_m
-from gausslite_places.surface_registration import Registration, Surface, can_match_without_guess, depth_points, register
+from gausslite_places.matcher_process import MATCHER
+from gausslite_places.surface_registration import (
+    Registration,
+    Surface,
+    can_match_without_guess,
+    depth_points,
+    matched_motion,
+    register,
+)
 
 needs_matcher = pytest.mark.skipif(not can_match_without_guess(), reason="kiss-matcher comes with the extra slam")
 
@@ -85,3 +93,18 @@ def test_the_information_is_smaller_along_the_freer_axis() -> None:
     assert found is not None
     np.testing.assert_allclose(found.information, found.information.T)
     assert (np.linalg.eigvalsh(found.information) > 0).all()
+
+
+@needs_matcher
+def test_matches_come_from_a_process_that_is_started_again_when_it_has_grown_or_was_killed() -> None:
+    a, _, _ = _views((0.6, 0.8, 20), (0.7, 1.4, -5))
+    # two clouds that are the same have the most matches, which the library never frees
+    found, processes = [], set()
+    for call in range(12):
+        found.append(matched_motion(_surface(a), _surface(a)))
+        assert MATCHER._process is not None
+        processes.add(MATCHER._process.pid)
+        if call == 1:
+            MATCHER._process.kill()
+    assert [T is not None and np.allclose(T, np.eye(4), atol=1e-3) for T in found] == [True] * 12
+    assert len(processes) > 2
