@@ -133,19 +133,18 @@ class ScoreIndex:
 
     def memory_bytes(self, names: Iterable[str], name: str, added: Int64[ndarray, " k"]) -> int:
         """Return the memory that these maps take, see _Map, with voxels added to one, at most."""
-        added_tiles = self._map(name).tiles.get(np.unique(tiles_at(places_of(added))))
-        tiles = int(np.count_nonzero(added_tiles["written"] == 0))
+        tiles = np.count_nonzero(self._map(name).tiles.get(np.unique(tiles_at(places_of(added))))["written"] == 0)
         before = sum(self._maps[own].memory_bytes for own in names)
-        return before + (VOXEL_BYTES + COMPARED_BYTES) * len(added) + TILE_BYTES * tiles
+        return before + (VOXEL_BYTES + COMPARED_BYTES) * len(added) + TILE_BYTES * int(tiles)
 
     def digests(self, name: str) -> TileDigests:
         """Return the digests of a map's rows, which are kept with each change; empty for an unknown one."""
         places, tiles = self._map(name).tiles.select()
         return TileDigests(keys_of(places), np.ascontiguousarray(tiles["digests"]))
 
-    def keys(self, name: str) -> Int64[ndarray, " v"]:
-        """Return the keys of a map's voxels, ascending."""
-        return np.sort(keys_of(self._map(name).voxels.select()[0]))
+    def places(self, name: str) -> Int64[ndarray, " v"]:
+        """Return the places of a map's voxels, which later changes leave as they are."""
+        return self._map(name).voxels.select()[0]
 
     def scores_of(self, name: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the map's totals on these voxels, in their order."""

@@ -29,6 +29,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.epochs import RECORD as EPOCH
 from gausslite.fusion.epochs import agent_of
 from gausslite.fusion.limits import MissionConfig, SessionRecord
+from gausslite.fusion.packed_table import keys_of
 from gausslite.fusion.score_index import AgentTotals, Scores, VoxelScoreTable
 from gausslite.fusion.update_log import (
     LogChange,
@@ -203,7 +204,8 @@ class FusionStore(ABC):
     def keys(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Return the keys of an agent's updates (with tombstones), ascending."""
         with self._index_lock:
-            return self._log.index.keys(agent_id)
+            places = self._log.index.places(agent_id)
+        return np.sort(keys_of(places))
 
     def scores_of(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""

@@ -121,7 +121,6 @@ class UpdateChecks:
             raise errors.QuotaError(
                 f"agent {name}: expected a kappa of at most {bound} this long after its first join, got {largest}"
             )
-
         self._require_within_quotas(subset)
 
     def _require_within_quotas(self, subset: EncodedSubset) -> None:
