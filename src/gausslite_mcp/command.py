@@ -22,8 +22,9 @@ _ROLES = (Role.VIEWER, Role.OPERATOR)
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite mcp`."""
     add = parser.add_argument
-    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
-    add("--agent", metavar="HOST:PORT", default="", help="the robot's agent, for assign_task (default: none)")
+    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, an agent, or the output folder of a run")
+    agent_help = "the robot's agent, for assign_task (default: PLACE if it is one)"
+    add("--agent", metavar="HOST:PORT", default="", help=agent_help)
     http_help = f"serve http://HOST:PORT{_PATH}, not stdin and stdout; beyond this machine it needs --tokens"
     add("--http", metavar="HOST:PORT", help=http_help)
     tokens_help = "file of lines ROLE TOKEN; viewer reads, operator also changes things (without it, HTTP only reads)"

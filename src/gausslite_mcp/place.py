@@ -1,4 +1,4 @@
-"""A place that programs ask: the objects and the map of a run's folder, or of a fusion server."""
+"""A place that programs ask: the objects and the map of a run's folder, a fusion server or an agent."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from gausslite.codec.ply import StoredMap, gaussians_from_ply
 from gausslite.codec.run_files import KeyframeView, read_keyframe_views
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.gaussians import move_gaussians
+from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.objects import TeamObject
-from gausslite.domain.pose import UpAxis, inverse
+from gausslite.domain.pose import UpAxis, inverse, upward_axis
+from gausslite.domain.voxels import empty_batch
 from gausslite.mapping.free_space import DepthView
 from gausslite.render.rasterizer import Rendering
-from gausslite.wire.channel import require_callable
-from gausslite.wire.clients import Export, FusionClient
+from gausslite.wire.channel import is_agent, require_callable
+from gausslite.wire.clients import AgentClient, Export, FusionClient
 from gausslite.wire.convert import camera_from_message, transform_from_message
 from gausslite.wire.security import Tls
 from gausslite_export.formats import upright_motion
@@ -140,42 +141,79 @@ class RunPlace:
         return open_memory(self.name)
 
 
-class ServerPlace:
-    """A fusion server: each call sees its objects of now; the map is fetched again when its revision has changed."""
+class ServicePlace:
+    """A fusion server or an agent: each call sees its objects of now; the map is fetched again when it has changed."""
 
     def __init__(self, address: str, tls: Tls | None = None, threads: int | None = None) -> None:
-        require_callable("no such folder; a fusion server", address)
+        require_callable("no such folder; a fusion server or an agent", address)
         self.name, self._tls, self._threads = address, tls, threads
         self._lock, self._revision = RLock(), -1
         self._scene: Scene | None = None
 
     def objects(self) -> MappedObjects:
-        """Return the team's objects. Raises UnavailableError."""
+        """Return the objects of the team or of the agent. Raises UnavailableError."""
         return query(self.name, self._tls)
 
     def memory(self) -> ObjectMemory:
-        """Return the edits and areas of the server."""
+        """Return the edits and areas of the service."""
         return open_memory(self.name, self._tls)
 
     def scene(self) -> Scene:
-        """Return the fused map with the keyframes that the server has. Raises UnavailableError."""
-        with self._lock, FusionClient(self.name, tls=self._tls) as client:
-            status = client.status()
-            if self._scene is None or status.fused_revision != self._revision:
-                gaussians = gaussians_from_ply(client.export(Export()))
+        """Return the map with the keyframes that the service has. Raises UnavailableError, InvalidInputError."""
+        with self._lock:
+            read = _agent_map if is_agent(self.name, self._tls) else _team_map
+            newer = read(self.name, self._tls, self._revision)
+            if newer is not None:
+                gaussians = newer.gaussians
                 if not len(gaussians):
                     raise InvalidInputError(f"{self.name}: expected a map with Gaussians, got an empty one")
                 splats = StoredMap(gaussians, "", np.zeros((len(gaussians), 3, 0), np.float32))
-                agents = [agent.agent_id for agent in status.agents if agent.keyframes]
-                views = [view for agent_id in agents for view in _agent_views(client, agent_id)]
-                self._scene = Scene(splats, evenly(views, _MAX_VIEWS), (0.0, 0.0, 1.0), self._threads)
-                self._revision = status.fused_revision
+                self._scene = Scene(splats, evenly(newer.views, _MAX_VIEWS), newer.up_axis, self._threads)
+                self._revision = newer.revision
+            assert self._scene is not None
             return self._scene
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _LiveMap:
+    """What a service maps at a revision."""
+
+    revision: int
+    gaussians: Gaussians
+    views: Sequence[KeyframeView]
+    up_axis: UpAxis = (0.0, 0.0, 1.0)
+
+
+def _team_map(address: str, tls: Tls | None, known: int) -> _LiveMap | None:
+    """Return the fused map; None if its revision is known."""
+    with FusionClient(address, tls=tls) as client:
+        status = client.status()
+        if status.fused_revision == known:
+            return None
+        agents = [agent.agent_id for agent in status.agents if agent.keyframes]
+        views = [view for agent_id in agents for view in _agent_views(client, agent_id)]
+        return _LiveMap(status.fused_revision, gaussians_from_ply(client.export(Export())), views)
+
+
+def _agent_map(address: str, tls: Tls | None, known: int) -> _LiveMap | None:
+    """Return an agent's map; None if its revision is known."""
+    with AgentClient(address, tls=tls) as client:
+        revision, batch = client.status().map_revision, empty_batch()
+        if revision == known:
+            return None
+        for update in client.watch_map():
+            batch = update.apply_to(batch)
+            if update.last:
+                break
+        seen = client.camera_view()
+    poses = [transform_from_message("keyframes", message) for message in seen.keyframes]
+    views = [KeyframeView(i, 0, camera_from_message(seen.camera), T, 0) for i, T in enumerate(poses)]
+    return _LiveMap(revision, batch.gaussians, views, upward_axis(np.reshape(poses, (-1, 4, 4))))
+
+
 def open_place(place: str, tls: Tls | None = None, threads: int | None = None) -> Place:
-    """Return the place of a folder's path or a server's address. Raises InvalidInputError, MapFileError."""
-    return RunPlace(Path(place), threads) if Path(place).is_dir() else ServerPlace(place, tls, threads)
+    """Return the place of a folder's path or a service's address. Raises InvalidInputError, MapFileError."""
+    return RunPlace(Path(place), threads) if Path(place).is_dir() else ServicePlace(place, tls, threads)
 
 
 def find_object(objects: MappedObjects, name: str) -> TeamObject:

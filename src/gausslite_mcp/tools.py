@@ -16,13 +16,14 @@ from gausslite.codec.json import graph_as_json
 from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_instance
 from gausslite.domain.errors import InvalidInputError
+from gausslite.wire.channel import is_agent
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.security import Tls
 from gausslite_export.occupancy import FREE, OCCUPIED, UNKNOWN
 from gausslite_mcp.context import relations_of
 from gausslite_mcp.goals import GoalSettings, goal_near
 from gausslite_mcp.object_views import VIEW_CAMERA, best_view, look_at
-from gausslite_mcp.place import Place, Scene, find_object
+from gausslite_mcp.place import Place, Scene, ServicePlace, find_object
 from gausslite_objects.edits import EditKind
 from gausslite_objects.mapped_objects import as_json, select
 
@@ -35,7 +36,7 @@ _CELLS = {UNKNOWN: "unknown", FREE: "free", OCCUPIED: "occupied"}
 
 @dataclass(frozen=True, slots=True)
 class PlaceTools:
-    """Answers about one place. agent: address of the robot that tasks are assigned to; empty without one."""
+    """Answers about one place. agent: address of the robot that tasks are assigned to, by default the place."""
 
     place: Place
     agent: str = ""
@@ -132,10 +133,11 @@ class PlaceTools:
 
     def assign_task(self, task: str) -> dict[str, Any]:
         """Assign a task to the robot; returns its graph. Raises TaskError, InvalidInputError, NotPermittedError."""
-        if not self.agent:
+        agent = self.agent or self.place.name
+        if not self.agent and not (isinstance(self.place, ServicePlace) and is_agent(agent, self.tls)):
             raise InvalidInputError("assign_task: expected a server that was started with --agent HOST:PORT")
         require_instance("task", task, str, "a sentence as text")
-        with AgentClient(self.agent, tls=self.tls) as client:
+        with AgentClient(agent, tls=self.tls) as client:
             return graph_as_json(client.assign_task(task))
 
 

@@ -18,7 +18,7 @@ from gausslite.codec.state_file import write_atomic
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import CodecError, InvalidInputError, MapFileError
 from gausslite.domain.objects import MAX_OBJECT_COORDINATE_M
-from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.task import Predicate, TargetRole, TaskGraph, noun_of
 from gausslite.mission.results import read_report
 
@@ -72,6 +72,11 @@ class Area:
         outline = np.ascontiguousarray((corners_m - point) @ plane, np.float32)
         return max(0.0, -cv2.pointPolygonTest(outline, (0.0, 0.0), True))
 
+    def moved(self, motion: Float64[ndarray, "4 4"]) -> Area:
+        """Return the area in another frame. Raises InvalidInputError if it is too far from its origin."""
+        corners_m = transform_points(motion, np.array(self.corners_m)).tolist()
+        return Area(self.name, tuple((x, y, z) for x, y, z in corners_m))
+
     def as_json(self) -> dict[str, Any]:
         """Return the area as JSON values."""
         return {"name": self.name, "corners_m": [list(corner) for corner in self.corners_m]}
@@ -92,6 +97,11 @@ def with_area(areas: Iterable[Area], area: Area) -> tuple[Area, ...]:
     if len(others) >= _MAX_AREAS:
         raise InvalidInputError(f"areas: expected at most {_MAX_AREAS}, got more")
     return (*others, area)
+
+
+def joined(own: Sequence[Area], others: Iterable[Area]) -> tuple[Area, ...]:
+    """Return own areas, and the others whose names are none of them."""
+    return (*own, *(area for area in others if not any(_is_named(area, known.name) for known in own)))
 
 
 def without_area(areas: Sequence[Area], name: str) -> tuple[Area, ...]:

@@ -38,7 +38,7 @@ from gausslite.perception.relevance import RelevanceEstimate, RelevanceEstimator
 from gausslite.perception.relevance_tracker import decode_landmark, encode_landmark
 from gausslite.perception.settings import EvidenceSettings
 from gausslite.perception.surface import SurfaceVotes
-from gausslite_objects.areas import Area, TaskPlaces, decode_areas, encode_areas
+from gausslite_objects.areas import Area, TaskPlaces, decode_areas, encode_areas, joined
 from gausslite_objects.edits import Edit, decode_edits, effective, encode_edits, is_denied
 
 _MAX_REPORTED = 100
@@ -51,6 +51,7 @@ _SAME_IOU = 0.4
 _MAX_RATIO = 2.5
 """Of the longest sides of one thing under two names."""
 _CLASSES = (MatchBasis.GENERIC, MatchBasis.REGION)
+_SAID = ("edits", "areas", "team_areas")
 
 
 class LightObjects:
@@ -67,16 +68,23 @@ class LightObjects:
         self._lock = Lock()
         self.edits: tuple[Edit, ...] = ()
         self.areas: tuple[Area, ...] = ()
+        self.team_areas: tuple[Area, ...] = ()
+        """Those named on the team's server, in this robot's frame; an own one of the same name wins."""
         self._graph = TaskGraph("", "", (), (), ())
         self.places = TaskPlaces.of(self._graph, ())
         """Where the objects of the task's nouns are."""
         self.changes = 0
         """How often people have changed what the task's nouns mean."""
 
-    def change(self, edits: tuple[Edit, ...], areas: tuple[Area, ...]) -> bool:
+    @property
+    def known_areas(self) -> tuple[Area, ...]:
+        """All areas that a task may name."""
+        return joined(self.areas, self.team_areas)
+
+    def change(self, edits: tuple[Edit, ...], areas: tuple[Area, ...], team_areas: tuple[Area, ...]) -> bool:
         """Replace what people said; return True if the task's nouns mean other objects now."""
-        before, self.edits, self.areas = self._meaning(), edits, areas
-        self.places = TaskPlaces.of(self._graph, areas)
+        before, self.edits, self.areas, self.team_areas = self._meaning(), edits, areas, team_areas
+        self.places = TaskPlaces.of(self._graph, self.known_areas)
         is_other = self._meaning() != before
         self.changes += is_other
         return is_other
@@ -98,7 +106,7 @@ class LightObjects:
 
     def remember(self, estimator: RelevanceEstimator, graph: TaskGraph) -> RelevanceEstimator:
         """Return the task's estimator with these objects after its own."""
-        self._graph, self.places = graph, TaskPlaces.of(graph, self.areas)
+        self._graph, self.places = graph, TaskPlaces.of(graph, self.known_areas)
         return RememberingEstimator(estimator, self)
 
     def _meaning(self) -> object:
@@ -142,21 +150,21 @@ class LightObjects:
         with self._lock:
             landmarks = self._seen.objects
             encoded = [add_prefix(f"landmark-{i}", encode_landmark(landmark)) for i, landmark in enumerate(landmarks)]
-        said = {"edits": encode_edits(self.edits), "areas": encode_areas(self.areas)}
-        arrays = {name: np.frombuffer(data, np.uint8) for name, data in said.items()}
+        said = encode_edits(self.edits), encode_areas(self.areas), encode_areas(self.team_areas)
+        arrays = {name: np.frombuffer(data, np.uint8) for name, data in zip(_SAID, said, strict=True)}
         return {"count": int_array(len(landmarks)), **arrays, **{name: own[name] for own in encoded for name in own}}
 
     def restore(self, state: State) -> None:
         """Replace what is remembered and said. Raises MapFileError, InvalidInputError."""
-        # runs that were saved before an agent had edits and areas have none
-        edits, areas = (
-            get_array(state, name, (None,), np.uint8).tobytes() if name in state else b"" for name in ("edits", "areas")
+        # runs that were saved before an agent had them have none
+        edits, *areas = (
+            get_array(state, name, (None,), np.uint8).tobytes() if name in state else b"" for name in _SAID
         )
         try:
-            self.edits, self.areas = decode_edits(edits), decode_areas(areas)
+            self.edits, (self.areas, self.team_areas) = decode_edits(edits), map(decode_areas, areas)
         except CodecError as error:
             raise MapFileError(f"state light objects: {error}") from error
-        self.places = TaskPlaces.of(self._graph, self.areas)
+        self.places = TaskPlaces.of(self._graph, self.known_areas)
         (count,) = get_counts(state, "count", 1)
         if count > len(state):
             raise MapFileError(f"state light objects: expected {count} landmarks, got fewer")

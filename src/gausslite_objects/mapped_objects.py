@@ -1,9 +1,9 @@
-"""Read the objects of a place, a fusion server or a run's folder, and choose those that a question means."""
+"""Read the objects of a place, a running service or a run's folder, and choose those that a question means."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,22 +44,40 @@ class MappedObjects:
 
 
 def query(address: str, tls: Tls | None) -> MappedObjects:
-    """Return the team's objects of a fusion server. Raises InvalidInputError, UnavailableError."""
+    """Return the objects of a fusion server's team, or of an agent. Raises InvalidInputError, UnavailableError."""
     # imported late, because the objects of a folder need no gRPC
-    from gausslite.wire.channel import require_callable
-    from gausslite.wire.clients import FusionClient
+    from gausslite.wire.channel import is_agent, require_callable
     from gausslite_objects.memory_client import ServerMemory
 
-    require_callable("no such folder; a fusion server", address)
+    require_callable("no such folder; a fusion server or an agent", address)
+    found = (_of_agent if is_agent(address, tls) else _of_team)(address, tls)
+    remarks, areas = ServerMemory(address, tls).remarks()
+    said = {name: own.notes for name, own in remarks.items()}
+    pinned = frozenset(name for name, own in remarks.items() if own.is_pinned)
+    edited = EditedObjects(tuple(own.landmark for own in found.objects), said, pinned, {})
+    return replace(found, edited=edited, areas=areas)
+
+
+def _of_team(address: str, tls: Tls | None) -> MappedObjects:
+    from gausslite.wire.clients import FusionClient
+
     with FusionClient(address, tls=tls) as client:
         left_out = client.unlocalised()
         notes = tuple(f"the objects of {agent_id} are left out; {reason}" for agent_id, reason in left_out.items())
-        objects = client.query_objects()
-        remarks, areas = ServerMemory(address, tls).remarks()
-    said = {name: own.notes for name, own in remarks.items()}
-    pinned = frozenset(name for name, own in remarks.items() if own.is_pinned)
-    edited = EditedObjects(tuple(found.landmark for found in objects), said, pinned, {})
-    return MappedObjects(objects, edited=edited, notes=notes, areas=areas)
+        return MappedObjects(client.query_objects(), notes=notes)
+
+
+def _of_agent(address: str, tls: Tls | None) -> MappedObjects:
+    from gausslite.wire.clients import AgentClient
+    from gausslite.wire.convert import transform_from_message
+    from gausslite.wire.convert_task import graph_from_message, object_from_message
+
+    with AgentClient(address, tls=tls) as client:
+        status, path = client.status(), client.camera_view().path
+    report = ObjectReport(graph_from_message(status.graph), tuple(map(object_from_message, status.objects)))
+    poses = np.reshape([transform_from_message("path", stamped.t_world_camera) for stamped in path], (-1, 4, 4))
+    last = poses[-1] if len(poses) else None
+    return MappedObjects(merge_objects({status.agent_id: report}), upward_axis(poses), T_world_camera=last)
 
 
 def read_folder(folder: Path) -> MappedObjects:

@@ -38,9 +38,13 @@ class MemoryClient(ServiceChannel):
         super().__init__(address, tls=tls)
         self._stub = pb_grpc.MemoryServiceStub(self._channel)
 
-    def read(self) -> pb.GetMemoryResponse:
-        """Return edits, areas and remarks; raises InvalidInputError where the server has no such service."""
-        return self._call(self._stub.GetMemory, pb.GetMemoryRequest())
+    def read(self, mission_id: str = "", agent_id: str = "") -> pb.GetMemoryResponse:
+        """Return edits, areas and remarks; of an agent the areas alone, in the frame of its map.
+
+        Raises InvalidInputError where the server has no such service.
+        """
+        request = pb.GetMemoryRequest(mission_id=mission_id, agent_id=agent_id)
+        return self._call(self._stub.GetMemory, request)
 
     def edit(self, kind: EditKind, object_id: str, value: str, author: str) -> EditEntry:
         """Correct an object."""

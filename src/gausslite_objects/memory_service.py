@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from gausslite.domain.pose import inverse
 from gausslite.fusion.engine import FusionEngine
 from gausslite.v1 import memory_service_pb2 as pb
 from gausslite.v1 import memory_service_pb2_grpc as pb_grpc
@@ -42,8 +43,8 @@ class ServedPlace(Protocol):
         """Replace the edits, durably."""
         ...
 
-    def areas(self) -> tuple[Area, ...]:
-        """Return the named areas."""
+    def areas(self, agent_id: str = "") -> tuple[Area, ...]:
+        """Return the named areas; agent_id: in the frame of this agent's map."""
         ...
 
     def save_areas(self, areas: tuple[Area, ...]) -> None:
@@ -110,6 +111,8 @@ class MemoryServicer(pb_grpc.MemoryServiceServicer):
 
     def _read(self, request: pb.GetMemoryRequest) -> pb.GetMemoryResponse:
         place = self._place(request.mission_id)
+        if request.agent_id:
+            return pb.GetMemoryResponse(areas=map(area_to_message, place.areas(request.agent_id)))
         edited = place.objects()
         return pb.GetMemoryResponse(
             edits=[entry_to_message(EditEntry.of(number, edit)) for number, edit in enumerate(place.edits(), 1)],
@@ -137,9 +140,13 @@ class TeamPlace:
         """Replace the edits. Raises StorageError."""
         self._engine.store.save_record(_NOBODY, EDITS_RECORD, encode_edits(edits))
 
-    def areas(self) -> tuple[Area, ...]:
-        """Return the named areas. Raises CodecError."""
-        return decode_areas(self._engine.store.find_record(_NOBODY, _AREAS_RECORD))
+    def areas(self, agent_id: str = "") -> tuple[Area, ...]:
+        """Return the named areas; none to an agent whose map is not used. Raises CodecError, InvalidInputError."""
+        frames, areas = self._engine.frames, decode_areas(self._engine.store.find_record(_NOBODY, _AREAS_RECORD))
+        if not agent_id:
+            return areas
+        T_agent_fused = inverse(frames.get(agent_id).T_fused_agent)
+        return () if agent_id in frames.unused else tuple(area.moved(T_agent_fused) for area in areas)
 
     def save_areas(self, areas: tuple[Area, ...]) -> None:
         """Replace the areas. Raises StorageError."""

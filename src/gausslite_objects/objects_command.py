@@ -26,7 +26,7 @@ _MAX_LISTED = 20
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite objects`."""
     add = parser.add_argument
-    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
+    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, an agent, or the output folder of a run")
     add(
         "question",
         metavar="QUESTION",

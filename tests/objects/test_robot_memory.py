@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from agent_running import Agent, agent
+from fusion_running import GRID, fusion_server
+from waiting import wait_until
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MismatchError
@@ -20,8 +22,14 @@ from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.settings import PerceptionSettings, SceneInfo
 from gausslite.v1 import memory_service_pb2 as pb
 from gausslite.wire.convert_task import object_from_message
+from gausslite.wire.server import Service
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import parse_arguments
 from gausslite_agent.state import SavedMission
+from gausslite_mcp.place import open_place
+from gausslite_mcp.tools import PlaceTools
+from gausslite_objects import robot_memory
 from gausslite_objects.areas import Area
 from gausslite_objects.edits import EditKind, apply_edits, read_edits
 from gausslite_objects.memory_client import MemoryClient, ServerMemory
@@ -52,8 +60,12 @@ def robot(*options: str) -> Iterator[tuple[Agent, ServerMemory]]:
     """Yield an agent that knows where its mugs are, restored if its state is saved, and its memory."""
     estimators = EstimatorFactory(PerceptionSettings(), lambda: SceneInfo(UP, REGIONS))
     settings = parse_arguments(["--agent-id", "robot", *options])
-    services = lambda worker, mission: [memory_service(worker, estimators, mission.save)]  # noqa: E731
-    with agent(estimators.build, options=options, added=services) as running:
+    with ExitStack() as stack:
+
+        def serve(worker: MappingWorker, mission: AgentMission) -> list[Service]:
+            return [stack.enter_context(memory_service(settings, worker, estimators, mission.save))]
+
+        running = stack.enter_context(agent(estimators.build, options=options, added=serve))
         if settings.state is not None and settings.state.exists():
             running.worker.restore(SavedMission.read(settings.state, *settings.fixed_settings)).result()
         yield running, ServerMemory(running.client.address)
@@ -132,6 +144,51 @@ def test_another_room_is_another_task() -> None:
         running.client.assign_task(hall)
         look(running, *range(6, 12))
         assert mugs(running)["mug-1"] is ObjectRole.OTHER
+
+
+def test_areas_of_a_server_reach_its_robots_in_their_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot_memory, "_INTERVAL_S", 0.02)
+    left = {"mug-1": ObjectRole.TARGET, "mug-2": ObjectRole.OTHER}
+    right = {"mug-1": ObjectRole.OTHER, "mug-2": ObjectRole.TARGET}
+    state = "--state", str(tmp_path / "robot.state")
+    with fusion_server() as server, robot(*state, "--fusion", server.client.address) as (running, memory):
+        running.client.assign_task(CORNER)
+        look(running, *range(6))
+        team = ServerMemory(server.client.address)
+        team.set_area(LEFT)
+        wait_until(lambda: mugs(running) == left)
+        assert memory.areas() == (LEFT,)
+        with pytest.raises(InvalidInputError, match="one that was named on this agent, got one of the team's server"):
+            memory.remove_area(LEFT.name)
+        memory.set_area(RIGHT)
+        assert mugs(running) == right
+        memory.remove_area(RIGHT.name)
+        assert mugs(running) == left
+        shift = np.eye(4)
+        shift[0, 3] = -1.0
+        server.client.join("robot", GRID, T_fused_agent=shift)
+        wait_until(lambda: mugs(running) == right)
+        memory.edit(EditKind.PIN, "mug-1")
+    with robot(*state) as (running, memory):
+        assert mugs(running) == right
+        assert memory.areas() == (RIGHT,)
+
+
+def test_a_running_robot_is_asked_looked_at_and_corrected() -> None:
+    with robot() as (running, memory):
+        tools = PlaceTools(open_place(running.client.address))
+        assert tools.assign_task("Find the mugs")["targets"] == ["mug"]
+        look(running, *range(6))
+        memory.set_area(LEFT)
+        [mug] = tools.list_objects("what is in the dining corner")["objects"]
+        assert (mug["id"], mug["observers"][0]["agent_id"]) == ("mug-1", "robot")
+        scene = tools.place.scene()
+        assert (scene.up_axis, len(scene.views) > 0, tools.place.scene() is scene) == (UP, True, True)
+        assert tools.best_view("mug-1")[0]["visible"] > 0.3
+        look(running, 6, 7)
+        assert tools.place.scene() is not scene
+        tools.edit_object("delete", "mug-2", "", "ann")
+        assert [found["id"] for found in tools.list_objects("mug")["objects"]] == ["mug-1"]
 
 
 def test_what_a_robot_cannot_correct_is_said_in_one_line() -> None:

@@ -176,7 +176,8 @@ async def _serve(settings: AgentSettings) -> int:
             page = load_pages("--view").service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls)
             stack.enter_context(page)
         run_mission = functools.partial(_run_mission, settings, mission, stream, first_parser)
-        added = [create(worker, estimators, mission.save) for _, create in installed(Group.AGENT_SERVICES)]
+        services = [create(settings, worker, estimators, mission.save) for _, create in installed(Group.AGENT_SERVICES)]
+        added = [stack.enter_context(service) for service in services]
         await serve_until_stopped(settings.listen, [servicer.service(), *added], run_mission, settings.tls)
         lost = mission.describe_lost_data()
         if lost:

@@ -25,15 +25,15 @@ _sym_db = _symbol_database.Default()
 from gausslite.v1 import geometry_pb2 as gausslite_dot_v1_dot_geometry__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!gausslite/v1/memory_service.proto\x12\x0cgausslite.v1\x1a\x1bgausslite/v1/geometry.proto\"\x85\x01\n\nObjectEdit\x12\x0e\n\x06number\x18\x01 \x01(\r\x12$\n\x04kind\x18\x02 \x01(\x0e\x32\x16.gausslite.v1.EditKind\x12\x11\n\tobject_id\x18\x03 \x01(\t\x12\r\n\x05value\x18\x04 \x01(\t\x12\x0e\n\x06\x61uthor\x18\x05 \x01(\t\x12\x0f\n\x07time_ns\x18\x06 \x01(\x03\"\x7f\n\x11\x45\x64itObjectRequest\x12\x12\n\nmission_id\x18\x01 \x01(\t\x12$\n\x04kind\x18\x02 \x01(\x0e\x32\x16.gausslite.v1.EditKind\x12\x11\n\tobject_id\x18\x03 \x01(\t\x12\r\n\x05value\x18\x04 \x01(\t\x12\x0e\n\x06\x61uthor\x18\x05 \x01(\t\"<\n\x12\x45\x64itObjectResponse\x12&\n\x04\x65\x64it\x18\x01 \x01(\x0b\x32\x18.gausslite.v1.ObjectEdit\"<\n\x04\x41rea\x12\x0c\n\x04name\x18\x01 \x01(\t\x12&\n\tcorners_m\x18\x02 \x03(\x0b\x32\x13.gausslite.v1.Point\"F\n\x0eSetAreaRequest\x12\x12\n\nmission_id\x18\x01 \x01(\t\x12 \n\x04\x61rea\x18\x02 \x01(\x0b\x32\x12.gausslite.v1.Area\"\x11\n\x0fSetAreaResponse\"&\n\x10GetMemoryRequest\x12\x12\n\nmission_id\x18\x01 \x01(\t\"D\n\rObjectRemarks\x12\x11\n\tobject_id\x18\x01 \x01(\t\x12\x11\n\tis_pinned\x18\x02 \x01(\x08\x12\r\n\x05notes\x18\x03 \x03(\t\"\x8d\x01\n\x11GetMemoryResponse\x12\'\n\x05\x65\x64its\x18\x01 \x03(\x0b\x32\x18.gausslite.v1.ObjectEdit\x12!\n\x05\x61reas\x18\x02 \x03(\x0b\x32\x12.gausslite.v1.Area\x12,\n\x07remarks\x18\x03 \x03(\x0b\x32\x1b.gausslite.v1.ObjectRemarks*\xb6\x01\n\x08\x45\x64itKind\x12\x19\n\x15\x45\x44IT_KIND_UNSPECIFIED\x10\x00\x12\x14\n\x10\x45\x44IT_KIND_DELETE\x10\x01\x12\x14\n\x10\x45\x44IT_KIND_RENAME\x10\x02\x12\x13\n\x0f\x45\x44IT_KIND_MERGE\x10\x03\x12\x13\n\x0f\x45\x44IT_KIND_SPLIT\x10\x04\x12\x11\n\rEDIT_KIND_PIN\x10\x05\x12\x12\n\x0e\x45\x44IT_KIND_NOTE\x10\x06\x12\x12\n\x0e\x45\x44IT_KIND_UNDO\x10\x07\x32\xf6\x01\n\rMemoryService\x12O\n\nEditObject\x12\x1f.gausslite.v1.EditObjectRequest\x1a .gausslite.v1.EditObjectResponse\x12\x46\n\x07SetArea\x12\x1c.gausslite.v1.SetAreaRequest\x1a\x1d.gausslite.v1.SetAreaResponse\x12L\n\tGetMemory\x12\x1e.gausslite.v1.GetMemoryRequest\x1a\x1f.gausslite.v1.GetMemoryResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!gausslite/v1/memory_service.proto\x12\x0cgausslite.v1\x1a\x1bgausslite/v1/geometry.proto\"\x85\x01\n\nObjectEdit\x12\x0e\n\x06number\x18\x01 \x01(\r\x12$\n\x04kind\x18\x02 \x01(\x0e\x32\x16.gausslite.v1.EditKind\x12\x11\n\tobject_id\x18\x03 \x01(\t\x12\r\n\x05value\x18\x04 \x01(\t\x12\x0e\n\x06\x61uthor\x18\x05 \x01(\t\x12\x0f\n\x07time_ns\x18\x06 \x01(\x03\"\x7f\n\x11\x45\x64itObjectRequest\x12\x12\n\nmission_id\x18\x01 \x01(\t\x12$\n\x04kind\x18\x02 \x01(\x0e\x32\x16.gausslite.v1.EditKind\x12\x11\n\tobject_id\x18\x03 \x01(\t\x12\r\n\x05value\x18\x04 \x01(\t\x12\x0e\n\x06\x61uthor\x18\x05 \x01(\t\"<\n\x12\x45\x64itObjectResponse\x12&\n\x04\x65\x64it\x18\x01 \x01(\x0b\x32\x18.gausslite.v1.ObjectEdit\"<\n\x04\x41rea\x12\x0c\n\x04name\x18\x01 \x01(\t\x12&\n\tcorners_m\x18\x02 \x03(\x0b\x32\x13.gausslite.v1.Point\"F\n\x0eSetAreaRequest\x12\x12\n\nmission_id\x18\x01 \x01(\t\x12 \n\x04\x61rea\x18\x02 \x01(\x0b\x32\x12.gausslite.v1.Area\"\x11\n\x0fSetAreaResponse\"8\n\x10GetMemoryRequest\x12\x12\n\nmission_id\x18\x01 \x01(\t\x12\x10\n\x08\x61gent_id\x18\x02 \x01(\t\"D\n\rObjectRemarks\x12\x11\n\tobject_id\x18\x01 \x01(\t\x12\x11\n\tis_pinned\x18\x02 \x01(\x08\x12\r\n\x05notes\x18\x03 \x03(\t\"\x8d\x01\n\x11GetMemoryResponse\x12\'\n\x05\x65\x64its\x18\x01 \x03(\x0b\x32\x18.gausslite.v1.ObjectEdit\x12!\n\x05\x61reas\x18\x02 \x03(\x0b\x32\x12.gausslite.v1.Area\x12,\n\x07remarks\x18\x03 \x03(\x0b\x32\x1b.gausslite.v1.ObjectRemarks*\xb6\x01\n\x08\x45\x64itKind\x12\x19\n\x15\x45\x44IT_KIND_UNSPECIFIED\x10\x00\x12\x14\n\x10\x45\x44IT_KIND_DELETE\x10\x01\x12\x14\n\x10\x45\x44IT_KIND_RENAME\x10\x02\x12\x13\n\x0f\x45\x44IT_KIND_MERGE\x10\x03\x12\x13\n\x0f\x45\x44IT_KIND_SPLIT\x10\x04\x12\x11\n\rEDIT_KIND_PIN\x10\x05\x12\x12\n\x0e\x45\x44IT_KIND_NOTE\x10\x06\x12\x12\n\x0e\x45\x44IT_KIND_UNDO\x10\x07\x32\xf6\x01\n\rMemoryService\x12O\n\nEditObject\x12\x1f.gausslite.v1.EditObjectRequest\x1a .gausslite.v1.EditObjectResponse\x12\x46\n\x07SetArea\x12\x1c.gausslite.v1.SetAreaRequest\x1a\x1d.gausslite.v1.SetAreaResponse\x12L\n\tGetMemory\x12\x1e.gausslite.v1.GetMemoryRequest\x1a\x1f.gausslite.v1.GetMemoryResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.memory_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_EDITKIND']._serialized_start=815
-  _globals['_EDITKIND']._serialized_end=997
+  _globals['_EDITKIND']._serialized_start=833
+  _globals['_EDITKIND']._serialized_end=1015
   _globals['_OBJECTEDIT']._serialized_start=81
   _globals['_OBJECTEDIT']._serialized_end=214
   _globals['_EDITOBJECTREQUEST']._serialized_start=216
@@ -47,11 +47,11 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_SETAREARESPONSE']._serialized_start=541
   _globals['_SETAREARESPONSE']._serialized_end=558
   _globals['_GETMEMORYREQUEST']._serialized_start=560
-  _globals['_GETMEMORYREQUEST']._serialized_end=598
-  _globals['_OBJECTREMARKS']._serialized_start=600
-  _globals['_OBJECTREMARKS']._serialized_end=668
-  _globals['_GETMEMORYRESPONSE']._serialized_start=671
-  _globals['_GETMEMORYRESPONSE']._serialized_end=812
-  _globals['_MEMORYSERVICE']._serialized_start=1000
-  _globals['_MEMORYSERVICE']._serialized_end=1246
+  _globals['_GETMEMORYREQUEST']._serialized_end=616
+  _globals['_OBJECTREMARKS']._serialized_start=618
+  _globals['_OBJECTREMARKS']._serialized_end=686
+  _globals['_GETMEMORYRESPONSE']._serialized_start=689
+  _globals['_GETMEMORYRESPONSE']._serialized_end=830
+  _globals['_MEMORYSERVICE']._serialized_start=1018
+  _globals['_MEMORYSERVICE']._serialized_end=1264
 # @@protoc_insertion_point(module_scope)

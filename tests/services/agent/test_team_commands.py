@@ -67,7 +67,7 @@ def test_errors_are_one_line(
         (["status", ""], "address: expected HOST:PORT or unix:PATH, got ''"),
         (["end", "nowhere"], "gausslite: address of the agent: expected HOST:PORT or unix:PATH, got 'nowhere'"),
         (["fetch", "http://host:1", "--out", str(tmp_path / "x.ply")], "expected HOST:PORT without http://, got"),
-        (["objects", str(tmp_path / "none")], "no such folder; a fusion server: expected HOST:PORT"),
+        (["objects", str(tmp_path / "none")], "no such folder; a fusion server or an agent: expected HOST:PORT"),
         (["end", fusion.client.address], "another service listens there"),
         (["fetch", robot.client.address, "--out", str(tmp_path / "x.ply")], "another service listens there"),
         (["fetch", fusion.client.address, "--out", str(tmp_path / "x.ply")], "the map is empty: the server has no"),
