@@ -47,10 +47,10 @@ _NUISANCE_STD = 1.0
 """Prior of the global gain and offset that are fitted along with the pose and then dropped."""
 _CONVERGED = 1e-4
 """A level ends when the pose changes by less than this, in metres and radians."""
-_FIT_TRANSLATION_STD_M, _FIT_ROTATION_STD_DEG = 0.002, 0.1
-"""Error of the fit itself on a map that still grows, measured where poses are exact.
+_FIT_STD_PX = 0.1
+"""Error of the fit itself on a map that still grows, at the median depth: a larger image gives a better fit.
 
-`shrinkage` leaves a part of every true correction undone, so these must stay small.
+`shrinkage` leaves a part of every true correction undone, so this must stay small.
 """
 
 
@@ -250,8 +250,9 @@ def fit_pose(
     solution = _solve(model, frame, REFINEMENT, T_rendered_odometry, prior_std)
     assert solution is not None
     deviation = twist_of(solution.T_camera_rendered @ T_rendered_odometry)
-    deviation[:3] *= shrinkage(prior.translation_m, _FIT_TRANSLATION_STD_M)
-    deviation[3:] *= shrinkage(prior.rotation_deg, _FIT_ROTATION_STD_DEG)
+    fit_std_rad = _FIT_STD_PX / frame.camera.fx_px
+    deviation[:3] *= shrinkage(prior_std[0], fit_std_rad * float(np.median(model.points[:, 2])))
+    deviation[3:] *= shrinkage(prior_std[3], fit_std_rad)
     T_world_camera: Float64[ndarray, "4 4"] = frame.T_world_camera @ inverse(transform_of(deviation))
     return T_world_camera
 

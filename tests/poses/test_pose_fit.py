@@ -67,6 +67,17 @@ def test_a_tighter_prior_keeps_the_pose_closer_to_the_odometry() -> None:
     assert deviations_m[0] < 1e-9
 
 
+def test_a_larger_image_leaves_less_of_a_correction_undone() -> None:
+    kept = []
+    for scale in (1, 4):
+        true = wall_frame(size=(96 * scale, 72 * scale))
+        wrong = displaced(true, 0.005, 0.0)
+        T_world_camera = fit_pose(rendering_like(true), inverse(true.T_world_camera), wrong, PoseExposurePrior(0.001))
+        kept.append(translation_m(T_world_camera, wrong.T_world_camera) / 0.005)
+    assert kept[0] < 0.4
+    assert kept[1] > 0.6
+
+
 def test_fit_exposure_recovers_a_known_exposure_and_inverts_it() -> None:
     frame = wall_frame(size=SIZE)
     exposure = AffineExposure(np.array([0.8, 0.9, 0.7]), np.array([0.05, 0.0, 0.1]))
