@@ -16,16 +16,16 @@ from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.objects import ObjectLandmark
-from gausslite_objects.life import Life, LifeState, life_of
-from gausslite_objects.visit import GRID, STAYS_M, Visit, cell_neighbours, is_empty, near_boxes
+from gausslite_objects.life import MIN_KNOWN, Life, LifeState, life_of
+from gausslite_objects.visit import CLEAR_M, GRID, STAYS_M, Visit, cell_neighbours, is_empty, near_boxes
 
 _SAME_PLACE_M = 0.15
 """An object is where it was if its centre moved less than this, or less than half of its longest side."""
 _MAX_RATIO = 2.5
 """Of the longest sides of one object in two runs."""
 _EXPLAINED_M = 0.1
-_CORE_M, _MIN_CORE = 0.07, 4
-"""A change has so many cells this far from what stays: errors of poses and depth are slivers along it."""
+_MIN_CORE = 6
+"""Clear cells of a change; in halves of three recordings, errors have up to 5."""
 _MIN_SIDE_M = 0.08
 _GROWTH = 0.25
 """A thing reaches beyond what is seen to have changed by this share of that part's longest side, where nothing is
@@ -212,6 +212,11 @@ class _Surface:
         """Side lengths of its box."""
         return _point(np.ptp(self.points_m, axis=0))
 
+    def touches(self, other: _Surface) -> bool:
+        """Return whether the boxes are less than the size of a thing apart."""
+        apart_m = np.abs(np.subtract(self.centre_m, other.centre_m)) - 0.5 * np.add(self.size_m, other.size_m)
+        return bool((apart_m < _EXPLAINED_M).all())
+
     def difference(self, other: _Surface) -> float:
         """Return how much two surfaces differ in size and colour: 1 at the limits of one thing."""
         sizes = np.sort(np.maximum([self.size_m, other.size_m], _MIN_SIDE_M), axis=1)[:, 1:]
@@ -228,8 +233,23 @@ def _point(values: Float32[ndarray, "3"]) -> Point:
 
 
 def _surfaces(visit: Visit, other: Visit, explained: Sequence[ObjectLandmark]) -> Iterator[_Surface]:
-    """Yield the things without a name of a visit whose places the other visit's views saw empty."""
-    points_m = visit.surface_m
+    """Yield the things without a name of a visit whose places the other visit's views saw empty; thin ones last."""
+    found = list(_emptied(visit, other, visit.surface_m, visit.is_repeated, explained))
+    yield from found
+    both_m = np.concatenate([visit.surface_m, visit.thin_m])
+    is_repeated = np.concatenate([visit.is_repeated, np.ones(len(visit.thin_m), np.bool_)])
+    for surface in _emptied(visit, other, both_m, is_repeated, explained):
+        if not any(surface.touches(known) for known in found):
+            yield surface
+
+
+def _emptied(
+    visit: Visit,
+    other: Visit,
+    points_m: Float32[ndarray, "n 3"],
+    is_repeated: Bool[ndarray, " n"],
+    explained: Sequence[ObjectLandmark],
+) -> Iterator[_Surface]:
     through, shown = (np.zeros(len(points_m), np.int64) for _ in range(2))
     for through_here, shown_here, _ in other.verdicts(points_m):
         through += through_here
@@ -238,12 +258,15 @@ def _surfaces(visit: Visit, other: Visit, explained: Sequence[ObjectLandmark]) -
     is_gone = is_empty(through, shown) & (distances_m > STAYS_M) & ~near_boxes(explained, _EXPLAINED_M, points_m)
     open_m = points_m[(through == 0) & (distances_m > STAYS_M)]
     gone_m = points_m[is_gone]
-    is_core = visit.is_repeated[is_gone] & (distances_m[is_gone] > _CORE_M)
+    is_core = is_repeated[is_gone] & (distances_m[is_gone] > CLEAR_M)
     for rows in _connected(gone_m):
         thing_m = gone_m[rows]
         if np.count_nonzero(is_core[rows]) < _MIN_CORE:
             continue
         thing_m = np.concatenate([thing_m, open_m[_reached(thing_m, open_m)]])
+        # else it is the rim of a surface that the other visit did not look at
+        if len(rows) < MIN_KNOWN * len(thing_m):
+            continue
         surface = _Surface(thing_m, visit.colour_of(thing_m))
         if sorted(surface.size_m)[1] >= _MIN_SIDE_M:
             yield surface

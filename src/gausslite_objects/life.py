@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite_objects.visit import MIN_POINTS, Visit, is_empty
+from gausslite_objects.visit import CLEAR_M, MIN_POINTS, Visit, is_empty
 
-_MIN_KNOWN, _MIN_EMPTY = 0.3, 0.5
-"""Shares: of a thing's points that views decide; of these, that are empty where it is absent."""
+MIN_KNOWN, _MIN_EMPTY, _MIN_CLEAR = 0.3, 0.5, 0.25
+"""Shares: of a thing's points that views decide; of these, that are empty if it is absent; of these, clear ones."""
 
 
 class LifeState(StrEnum):
@@ -59,7 +59,7 @@ def life_of(points_m: Float32[ndarray, "n 3"], visit: Visit) -> Life:
     through, shown, hidden = (np.zeros(len(points_m), np.int64) for _ in range(3))
     shown_ns: int | None = None
     absent_ns: int | None = None
-    needed = max(MIN_POINTS, _MIN_KNOWN * len(points_m))
+    needed = max(MIN_POINTS, MIN_KNOWN * len(points_m))
     for (through_here, shown_here, hidden_here), time_ns in zip(visit.verdicts(points_m), visit.times_ns, strict=True):
         through += through_here
         shown += shown_here
@@ -70,8 +70,12 @@ def life_of(points_m: Float32[ndarray, "n 3"], visit: Visit) -> Life:
             absent_ns = time_ns
     empty = is_empty(through, shown)
     known = empty | (shown > 0)
-    if np.count_nonzero(known) >= max(MIN_POINTS, _MIN_KNOWN * len(points_m)):
-        share = np.count_nonzero(empty) / np.count_nonzero(known)
-        return Life(LifeState.ABSENT if share >= _MIN_EMPTY else LifeState.PRESENT, share, shown_ns, absent_ns)
-    is_occluded = np.count_nonzero(hidden) > _MIN_KNOWN * len(points_m)
+    if np.count_nonzero(known) >= max(MIN_POINTS, MIN_KNOWN * len(points_m)):
+        empties = np.count_nonzero(empty)
+        # the others are slivers along what was measured: errors of poses
+        is_clear = np.count_nonzero(visit.distance_m(points_m[empty]) > CLEAR_M) >= _MIN_CLEAR * empties
+        share = empties / np.count_nonzero(known) if is_clear else 0.0
+        state = LifeState.ABSENT if share >= _MIN_EMPTY else LifeState.PRESENT
+        return Life(state, share, shown_ns, absent_ns if is_clear else None)
+    is_occluded = np.count_nonzero(hidden) > MIN_KNOWN * len(points_m)
     return Life(LifeState.OCCLUDED if is_occluded else LifeState.OUT_OF_VIEW, 0.0, shown_ns, absent_ns)

@@ -28,10 +28,14 @@ GRID = VoxelGrid(0.05)
 _MAX_DEPTH_M = 5.0
 _DEPTH_EDGE_PX = 1
 _MIN_PIXELS = 2
+_COS_HALF_ANGLE = np.cos(np.radians(5.0))
+"""Of the rays of two views that see one thin thing; with 7 degrees, halves of the kitchen have a false change."""
 _MIN_OPACITY = 0.5
 _MEASURED_GRID = VoxelGrid(0.025)
 STAYS_M = 0.04
 """Distance to what a visit has measured within which a point is on that surface: errors of poses and depth."""
+CLEAR_M = 0.07
+"""Distance from which it is on no measured surface: errors of poses and depth are slivers along one."""
 _BEHIND_M, _BEHIND_SHARE = 0.02, 0.01
 """A point farther from it is seen through if the depth behind it is farther by this."""
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
@@ -59,15 +63,34 @@ class Visit:
         return self._surface[1]
 
     @cached_property
-    def _surface(self) -> tuple[Float32[ndarray, "n 3"], Bool[ndarray, " n"]]:
-        points = list(map(_points, self.views))
+    def thin_m(self) -> Float32[ndarray, "n 3"]:
+        """Points of the surfaces beside jumps of depth, where errors lie along the rays: from several sides only."""
+        points_m, _, is_from_sides = self._cells(0)
+        is_thin = is_from_sides & ~np.isin(GRID.keys(points_m), GRID.keys(self.surface_m))
+        thin_m: Float32[ndarray, "n 3"] = points_m[is_thin]
+        return thin_m
+
+    @cached_property
+    def _surface(self) -> tuple[Float32[ndarray, "n 3"], Bool[ndarray, " n"], Bool[ndarray, " n"]]:
+        return self._cells(_DEPTH_EDGE_PX)
+
+    def _cells(self, edge_px: int) -> tuple[Float32[ndarray, "n 3"], Bool[ndarray, " n"], Bool[ndarray, " n"]]:
+        """Return the means of cells, which ones several views have measured, and which ones from several sides."""
+        points = [_points(view, edge_px) for view in self.views]
         view_of = np.repeat(np.arange(len(points)), [len(own) for own in points])
         points_m = np.concatenate([np.zeros((0, 3), np.float32), *points])
         means_m, cell, count = _cell_means(points_m, GRID)
-        measured = np.bincount(np.unique(cell * len(points) + view_of) // max(len(points), 1), minlength=len(count))
+        seen, by = np.divmod(np.unique(cell * len(points) + view_of), max(len(points), 1))
+        measured = np.bincount(seen, minlength=len(count))
         through, _ = view_counts(means_m.astype(np.float32), self.views)
         is_sure = (count >= _MIN_PIXELS) & ~is_empty(through, measured)
-        return means_m[is_sure].astype(np.float32), measured[is_sure] > 1
+        eyes_m = np.reshape([inverse(view.T_camera_world)[:3, 3] for view in self.views], (-1, 3))
+        rays = eyes_m[by] - means_m[seen]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        sums = np.stack([np.bincount(seen, weights=axis, minlength=len(count)) for axis in rays.T], axis=1)
+        # the mean of two unit vectors is as long as the cosine of half of their angle
+        is_from_sides = np.linalg.norm(sums, axis=1) <= _COS_HALF_ANGLE * measured
+        return means_m[is_sure].astype(np.float32), measured[is_sure] > 1, is_from_sides[is_sure]
 
     @cached_property
     def _measured(self) -> small_gicp.KdTree | None:

@@ -8,6 +8,7 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.mapping.free_space import DepthView
 from gausslite_objects.changes import Change, ChangeKind, compare_visits, with_earlier_objects
 from gausslite_objects.life import LifeState, life_of
 from gausslite_objects.visit import Visit, depth_view
@@ -95,6 +96,12 @@ def test_a_thing_is_present_absent_occluded_or_out_of_view(
     assert life.absent_ns == (3 if state is LifeState.ABSENT else None)
 
 
+@pytest.mark.parametrize(("shift_m", "share"), [(0.055, 0.0), (0.12, 1.0)])
+def test_what_lies_within_the_errors_of_poses_from_a_surface_is_not_gone(shift_m: float, share: float) -> None:
+    life = life_of(_grid(HERE, 0.3).astype(np.float32), _visit([(-0.5, 0.0, 2.0 + shift_m)], []))
+    assert (life.empty_share, life.state is LifeState.PRESENT) == (share, share == 0.0)
+
+
 def test_what_a_single_view_measures_is_no_thing() -> None:
     """The camera of the kitchenette measures half the distance on some pixels of one image."""
     once = _visit([HERE], [])
@@ -115,6 +122,33 @@ def test_surfaces_without_a_name_are_reported() -> None:
     assert gone.describe().startswith("something of 0.4")
     assert gone.size_m[:2] == pytest.approx((BOX_M, BOX_M), abs=0.03)
     assert gone.as_json()["before_m"] == pytest.approx(list(HERE), abs=0.06)
+
+
+@pytest.mark.parametrize(("step_m", "kinds"), [(0.4, [ChangeKind.GONE]), (0.02, [])])
+def test_thin_bars_are_a_thing_only_if_several_sides_show_them(step_m: float, kinds: list[ChangeKind]) -> None:
+    columns, rows = np.meshgrid(np.arange(CAMERA.width_px) + 0.5, np.arange(CAMERA.height_px) + 0.5)
+    y_m = 2.0 * (rows - CAMERA.cy_px) / CAMERA.fy_px
+    views: list[list[DepthView]] = [[], []]
+    for index in range(-2, 3):
+        T_world_camera = np.eye(4)
+        T_world_camera[0, 3] = step_m * index
+        x_m = 2.0 * (columns - CAMERA.cx_px) / CAMERA.fx_px + step_m * index
+        # two pixels wide, with four pixels between
+        bar = (np.abs(x_m) < 0.2) & (np.abs(y_m) < 0.3) & (x_m % (12.0 / CAMERA.fx_px) < 4.0 / CAMERA.fx_px)
+        for seen, is_there in zip(views, (bar, np.zeros_like(bar)), strict=True):
+            seen.append(depth_view(np.where(is_there, 2.0, WALL_M).astype(np.float32), CAMERA, T_world_camera))
+    before, after = (Visit(_scene(), [], seen, range(5)) for seen in views)
+    assert [change.kind for change in compare_visits(before, after)] == kinds
+
+
+@pytest.mark.parametrize(("share", "kinds"), [(0.6, [ChangeKind.GONE]), (0.29, [])])
+def test_the_rim_of_what_the_other_visit_does_not_see_is_no_change(share: float, kinds: list[ChangeKind]) -> None:
+    columns, rows = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
+    is_board = (np.abs(columns - CAMERA.cx_px) < 60) & (np.abs(rows - CAMERA.cy_px) < 60)
+    depths_m = np.where(is_board, 2.0, WALL_M), np.where(columns < share * CAMERA.width_px, WALL_M, 0.0)
+    views = ([depth_view(depth_m.astype(np.float32), CAMERA, np.eye(4))] * 2 for depth_m in depths_m)
+    before, after = (Visit(_scene(), [], seen, range(2)) for seen in views)
+    assert [change.kind for change in compare_visits(before, after)] == kinds
 
 
 def test_earlier_objects_come_along_unless_they_changed_or_were_found_again() -> None:

@@ -260,8 +260,7 @@ class Landmark:
         """
         surface, half_m = self.votes.box, 0.5 * CELL_M
         cells_m = self.footprint_m() if surface is None else VoxelGrid(CELL_M).centres_m(self.cells)
-        low_m, high_m = cells_m.min(axis=0) - half_m, cells_m.max(axis=0) + half_m
-        corners_m = np.stack([low_m, high_m]).astype(np.float64)
+        corners_m = np.stack([cells_m.min(axis=0) - half_m, cells_m.max(axis=0) + half_m]).astype(np.float64)
         if surface is not None:
             corners_m = np.clip(np.array([surface.min_m, surface.max_m]), *corners_m)
         return AxisAlignedBox.around(corners_m)
