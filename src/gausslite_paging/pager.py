@@ -31,7 +31,7 @@ from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.task_change import clear_roi
 from gausslite.mapping.window_view import WindowView
-from gausslite.process import print_message
+from gausslite.process import print_message, return_free_memory
 from gausslite.render.rasterizer import GRAD_2D_COUNT, LOG_SCALE
 from gausslite_paging.keyframe_images import KeyframeImages
 from gausslite_paging.page_file import Page, PageFile
@@ -45,6 +45,8 @@ _AT_ONCE = 1 / 16
 _REACH_PER_SCALE = 5.0
 """A splat touches pixels up to 3.33 standard deviations from its mean; beside the image of a wide camera, up to 4.5."""
 _REACH_MARGIN = 1.1
+_STORES_PER_RETURN = 16
+"""So often memory that was freed goes back to the system, which takes milliseconds: a map of any size leaves holes."""
 _DEPTH_STEP_PX = 4
 _PART_NUMBERS = 8
 _MAX_CORRECTIONS = 32
@@ -147,6 +149,7 @@ class DiskPager(MapPager):
         self._ready: frozenset[int] | None = None
         self._is_full = False
         self._unsent: set[int] = set()
+        self._stores = 0
 
     @property
     def count(self) -> int:
@@ -380,6 +383,9 @@ class DiskPager(MapPager):
             stored.append(rows)
             freed += len(rows)
         table.remove(np.concatenate(stored))
+        self._stores += 1
+        if self._stores % _STORES_PER_RETURN == 0:
+            return_free_memory()
 
     def _write(
         self, table: SplatTable, rows: Int64[ndarray, " m"], tile: int, bounds_m: Float64[ndarray, "2 3"]
