@@ -76,7 +76,8 @@ class PlaceSearch:
             self._part, whole = part, part.around(self._mapper.gaussians())
             render = MapViewer(whole, self._mapper.rasterizer).render
             self._places = self._described(render, [*self._earlier, *part.views])
-            self.restart()
+            # motions are in the same frame, but the view that was not recognised may be now
+            self._localiser, self._failed = SequenceLocaliser(self._places), None
         if self._failed is not None and _is_same_view(self._failed, frame):
             return None
         if self._localiser.is_done:

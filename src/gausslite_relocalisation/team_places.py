@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 _NEIGHBOURHOOD_M, _REACH_M = 20.0, 6.0
 """Teammates' views up to so far from the last known place, and the map up to so far from these."""
 _VIEWS_OF_A_ROBOT, _MAX_VIEWS = 24, 48
-_INTERVAL_S = 30.0
+_INTERVAL_S = 60.0
 """A team's map grows; after an error, the server may be back."""
 _NOT_FUSED = ("ALIGNMENT_STATE_QUARANTINED", "ALIGNMENT_STATE_UNLOCALISED")
 _View = tuple[Camera, Float64[ndarray, "4 4"]]

@@ -16,7 +16,8 @@ from gausslite_bench.cli.perception import add_perception_options, run_perceptio
 from gausslite_bench.cli.quality import configure_ablation, configure_compute, configure_quality
 from gausslite_bench.cli.team import configure_team
 from gausslite_bench.fuzz.run import FuzzSettings, run_fuzz
-from gausslite_bench.kidnaps import KidnapSettings, run_kidnaps
+from gausslite_bench.kidnap_events import KidnapSettings
+from gausslite_bench.kidnaps import run_kidnaps
 from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, run_gpu, run_raster
 from gausslite_bench.report import Report
 from gausslite_bench.server.bench import ServerBenchSettings, run_server
