@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--to", metavar="FORMAT", choices=names(Group.EXPORTERS), required=True, help=formats)
     add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")
     add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
-    voxel_help = f"voxel size in metres (default: {_OCCUPANCY.voxel_m:g}; mesh: {MESH_VOXEL_M:g})"
+    voxel_help = f"voxel size in metres (default: {_OCCUPANCY.voxel_m:g}; mesh: {MESH_VOXEL_M:g}, or what fits)"
     add("--voxel", metavar="M", type=bounded(float, 0.001, 10), help=voxel_help)
     opacity_help = f"for octomap, and for grids without keyframes (default: {_OCCUPANCY.min_opacity:g})"
     add("--min-opacity", metavar="A", type=bounded(float, 0, 1), help=opacity_help)

@@ -19,16 +19,17 @@ from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.datasets.folder import up_note
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
-from gausslite.domain.pose import transform_of, twist_of
+from gausslite.domain.pose import inverse, transform_of, twist_of
 from gausslite.mission.results import map_file
 from gausslite.process import import_extra, print_message
 from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
-from gausslite_export.mesh import write_mesh
+from gausslite_export.mesh import fitting_voxel_m, write_mesh
 from gausslite_export.occupancy import (
     NAV2_IMAGE,
     NO_VOXELS,
     FloorGrid,
     OccupancySettings,
+    floor_layer,
     near_middle,
     occupied_voxels,
     planar_grid,
@@ -199,7 +200,11 @@ def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None
 
 
 def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    render, voxel_m = settings.viewer(content.gaussians).render, settings.voxel_m or MESH_VOXEL_M
+    render, voxel_m = settings.viewer(content.gaussians).render, settings.voxel_m
+    if voxel_m is None:
+        voxel_m = fitting_voxel_m(content.chosen, MESH_VOXEL_M)
+        if voxel_m > MESH_VOXEL_M:
+            print_message(f"mesh: voxels of {voxel_m:g} m, the smallest that fit into memory")
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
@@ -226,15 +231,16 @@ def _distances(path: Path, content: MapContent, settings: ExportSettings) -> Non
 
 def _floor_grid(content: MapContent, settings: ExportSettings) -> FloorGrid:
     """Return the grid; say where its floor lies in the map's frame, which objects and areas have."""
+    T_map_upright, up = inverse(content.T_upright_map), stated_up(content.report) or (0.0, 0.0, 1.0)
+    rotations = np.array([(T_map_upright @ view.T_world_camera)[:3, :3] for view in content.views]).reshape(-1, 3, 3)
+    if note := up_note(rotations, up):
+        print_message(f"grid: its floor may be none: {note}, and map again")
     grid = _grid(content, settings)
     T = grid.T_map_grid
     *normal, height_m = (round(float(value), 3) + 0.0 for value in (*T[:3, 2], T[:3, 2] @ T[:3, 3]))
     plane = " + ".join(f"{value} {axis}" for value, axis in zip(normal, "xyz", strict=True) if value)
     turned = "" if normal == [0, 0, 1] else "; the grid is turned: p_map = T_map_grid p_grid, which the file has"
     print_message(f"the floor is where {plane} = {height_m} m in the map's frame, that of objects and areas{turned}")
-    poses = np.array([view.T_world_camera for view in content.views]).reshape(-1, 4, 4)
-    if not turned and (note := up_note(poses, (0.0, 0.0, 1.0))):
-        print_message(f"the grid may be a vertical slice: {note} for `map`")
     return grid
 
 
@@ -248,7 +254,19 @@ def _grid(content: MapContent, settings: ExportSettings) -> FloorGrid:
     surface = _within(around, votes.surface())
     if not len(surface):
         raise InvalidInputError("grid: expected a surface that the keyframes show, found none in the chosen Gaussians")
-    return planar_grid(surface, votes.free(), occupancy, content.T_upright_map)
+    free = votes.free()
+    above, below = (_free_share(surface[surface[:, 2] == floor_layer(surface)], step, free) for step in (2, -2))
+    if below > above:
+        print_message(
+            f"grid: its floor may be none: more of it is free below ({below:.0%}) than above ({above:.0%}); "
+            "is the map's up right?"
+        )
+    return planar_grid(surface, free, occupancy, content.T_upright_map)
+
+
+def _free_share(voxels: Int64[ndarray, "v 3"], step: int, free: Int64[ndarray, "f 3"]) -> float:
+    """Return the share of the voxels, at least one, that have a free one so many layers above."""
+    return len(set(map(tuple, np.add(voxels, (0, 0, step)).tolist())) & set(map(tuple, free.tolist()))) / len(voxels)
 
 
 def _within(points: Int64[ndarray, "v 3"], voxels: Int64[ndarray, "n 3"]) -> Int64[ndarray, "m 3"]:

@@ -48,10 +48,6 @@ class TsdfVolume:
 
     def __post_init__(self) -> None:
         count = math.prod(self.shape)
-        if count > _MAX_VOXELS:
-            enough_m = math.ceil(1050 * self.voxel_m * math.cbrt(count / _MAX_VOXELS)) / 1000
-            expected = f"expected at most {_MAX_VOXELS} voxels, got {count}"
-            raise InvalidInputError(f"mesh: {expected}; use a larger --voxel, such as {enough_m:g}")
         self.distances = np.ones(count, np.float32)
         self.weights = np.zeros(count, np.float32)
         self.colours = np.zeros((count, 3), np.float32)
@@ -127,13 +123,29 @@ def write_mesh(
     write_atomic(path, _ply_mesh(positions_m.astype(np.float32), colours, faces.astype(np.int32)))
 
 
-def _volume_around(gaussians: Gaussians, voxel_m: float) -> TsdfVolume:
-    """Return an empty volume around the Gaussians without the farthest 0.5 % along each axis."""
+def fitting_voxel_m(gaussians: Gaussians, least_m: float) -> float:
+    """Return the least voxel size, in millimetres above this one, with which the Gaussians' volume fits into memory."""
+    voxel_m = least_m
+    while math.prod(_bounds(gaussians, voxel_m)[1]) > _MAX_VOXELS:
+        voxel_m = math.ceil(1000 * 1.02 * voxel_m) / 1000
+    return voxel_m
+
+
+def _bounds(gaussians: Gaussians, voxel_m: float) -> tuple[Float64[ndarray, "3"], tuple[int, int, int]]:
+    """Return the origin and shape of a volume around the Gaussians without the farthest 0.5 % along each axis."""
     low, high = np.percentile(gaussians.means_m.astype(np.float64), _BOUNDS_PERCENTILES, axis=0)
     margin_m = (_TRUNCATION_VOXELS + 1) * voxel_m
-    origin_m = low - margin_m
-    shape = np.ceil((high + margin_m - origin_m) / voxel_m).astype(int)
-    return TsdfVolume(origin_m, voxel_m, (int(shape[0]), int(shape[1]), int(shape[2])))
+    x, y, z = np.ceil((high - low + 2 * margin_m) / voxel_m).astype(int).tolist()
+    return low - margin_m, (x, y, z)
+
+
+def _volume_around(gaussians: Gaussians, voxel_m: float) -> TsdfVolume:
+    """Return an empty volume around the Gaussians."""
+    origin_m, shape = _bounds(gaussians, voxel_m)
+    if (count := math.prod(shape)) > _MAX_VOXELS:
+        least_m = fitting_voxel_m(gaussians, voxel_m)
+        raise InvalidInputError(f"mesh: expected at most {_MAX_VOXELS} voxels, got {count}; use --voxel {least_m:g}")
+    return TsdfVolume(origin_m, voxel_m, shape)
 
 
 def _ply_mesh(

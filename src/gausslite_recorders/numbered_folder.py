@@ -71,7 +71,7 @@ class NumberedFolderSource(FolderSource):
         require_position(self.name, i, len(self))
         number = self._numbers[i]
         T_world_camera = self._read_pose(number)
-        image = load_rgbd(self._colours[number], self._depth_path(number), self._camera, self._units, size)
+        image = load_rgbd(self._colours[number], self._depth_path(number), self.camera, self._units, size)
         return image.frame(number, number * 10**9 // _RATE_HZ, T_world_camera)
 
     def indices(self) -> Sequence[int]:

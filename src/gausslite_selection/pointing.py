@@ -20,9 +20,11 @@ from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import PointedObject, Region
 from gausslite.perception.lifting import without_background_planes
 from gausslite.perception.surface import SurfaceVotes, mask_votes, surface_mask
+from gausslite.process import print_message
 from gausslite_detectors.depth_segmenter import DepthSegmenter
 
 _NEAR_M: Final = 0.05
+_MAX_SHARE: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,7 @@ def mask_on_image(
     mask = np.zeros(frame.depth_m.shape, np.bool_)
     for x, y in points_px:
         mask |= _grown(frame, *_pixel(frame, x, y), settings)
+        _warn_of_flood(f"point {x:g},{y:g}", frame, mask)
     for box in boxes_px:
         mask |= _in_box(frame, box, settings)
     return mask
@@ -110,7 +113,16 @@ def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tup
         place = ",".join(f"{value:g}" for value in point_m)
         raise InvalidInputError(f"target {place}: expected a point on a surface that a frame shows, none shows it")
     _, frame, (row, column) = best
-    return frame, _grown(frame, row, column, settings)
+    mask = _grown(frame, row, column, settings)
+    _warn_of_flood(f"target {','.join(f'{value:g}' for value in point_m)}", frame, mask)
+    return frame, mask
+
+
+def _warn_of_flood(place: str, frame: Frame, mask: Bool[ndarray, "h w"]) -> None:
+    """Say that a region has more of a frame's pixels with depth than most objects have."""
+    share = np.count_nonzero(mask) / np.count_nonzero(frame.depth_m > 0)
+    if share > _MAX_SHARE:
+        print_message(f"{place}: its region has {share:.0%} of frame {frame.index}; if that is too much, draw a box")
 
 
 def _require_numbers(name: str, value: object, count: int) -> None:
@@ -152,7 +164,7 @@ def _pixel(frame: Frame, x: float, y: float) -> tuple[int, int]:
         raise InvalidInputError(f"point {x:g},{y:g}: expected a pixel of the image of {width}x{height}")
     row, column = int(y), int(x)
     if not frame.depth_m[row, column] > 0:
-        raise InvalidInputError(f"point {x:g},{y:g}: expected a pixel with depth, frame {frame.index} has none there")
+        raise InvalidInputError(f"point {x:g},{y:g}: expected depth, frame {frame.index} has none there; draw a box")
     return row, column
 
 

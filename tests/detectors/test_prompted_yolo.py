@@ -10,7 +10,7 @@ from tiny_prompted import DIMENSIONS, WORDS, word_vectors, write_prompted, write
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import MatchBasis
+from gausslite.domain.objects import POINTING, MatchBasis
 from gausslite.perception.detector import Detector
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
@@ -120,7 +120,7 @@ def test_a_table_of_text_vectors_replaces_the_encoder(tmp_path):
     assert found[0].mask.sum() == 24 * 24
     tankard, umbrella = detector.matches(["beer tankard", "umbrella"])
     assert (tankard.classes, tankard.is_searched) == (("tankard",), True)
-    assert umbrella.warning == "no class of the detector matches 'umbrella'; point at it, or prompt a detector by text"
+    assert umbrella.warning == f"no class of the detector matches 'umbrella'; {POINTING}, or prompt a detector by text"
 
 
 def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):

@@ -11,7 +11,7 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import found_text
+from gausslite.domain.objects import POINTING, found_text
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector_file import DetectorOptions
@@ -157,7 +157,7 @@ def test_a_noun_without_a_class_is_unsupported(tmp_path):
     assert detector.detect(frame_with_red_square(), ["umbrella"]) == []
     cup, umbrella = detector.matches(["cup", "umbrella"])
     assert (cup.classes, cup.is_searched, cup.warning) == (("cup",), True, None)
-    expected = "no class of the detector matches 'umbrella'; point at it, or prompt a detector by text"
+    expected = f"no class of the detector matches 'umbrella'; {POINTING}, or prompt a detector by text"
     assert (umbrella.is_searched, umbrella.warning) == (False, expected)
 
 
@@ -202,12 +202,15 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
 @pytest.mark.parametrize(
     ("score", "expected"),
     [
-        (0.1, "seen in frame 3 with 0.10 (threshold 0.25): --set min-score=0.08, or point at it"),
-        (0.01, "not seen so far; point at it if a frame shows it"),
+        (0.1, f"seen in frame 3 with 0.10 (threshold 0.25): --set min-score=0.08, or {POINTING}"),
+        (
+            0.01,
+            "not seen so far; if a frame shows it, point at it (--set view=8099, or target-at=X,Y,Z,R without --task)",
+        ),
         (
             0.9,
             "seen in frame 3 with 0.90, but too large, without depth, or enlarged only: a lower min-score may do, "
-            "or point at it",
+            f"or {POINTING}",
         ),
     ],
 )

@@ -18,6 +18,7 @@ from gausslite.mapping.free_space import DepthView
 from gausslite.plugins import Group, load
 from gausslite.render.map_viewer import view_map
 from gausslite_export.format import ExportSettings, Format, MapContent
+from gausslite_export.formats import upright_motion
 from gausslite_export.occupancy import FREE, OCCUPIED, OccupancySettings, occupied_voxels
 from gausslite_export.surface_votes import count_votes
 
@@ -114,7 +115,7 @@ def test_a_grid_of_a_world_whose_up_is_not_stated_is_doubted(tmp_path, capsys):
     gaussians = move_gaussians(room(), T_camera_world)
     views = [dataclasses.replace(view, T_world_camera=T_camera_world @ view.T_world_camera) for view in VIEWS]
     export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=views))
-    assert "a vertical slice: the images show up as 0,-1,0, the layout as 0,0,1" in capsys.readouterr().err
+    assert "its floor may be none: upright images show up as 0,-1,0, not as 0,0,1" in capsys.readouterr().err
 
 
 def test_a_thin_surface_stays_where_most_images_see_past_it_and_one_error_is_none():
@@ -156,3 +157,34 @@ def test_a_floor_whose_ellipsoids_reach_below_and_above_it_is_free(tmp_path):
     cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians)))
     inside = slice(int((-1.7 - origin[0]) / VOXEL_M), int((1.7 - origin[0]) / VOXEL_M))
     assert (cells[inside, inside] == 254).mean() > 0.95
+
+
+def test_a_grid_says_that_its_floor_may_be_none(tmp_path, capsys):
+    # the same room with y as up: the cameras are level about z
+    gaussians = room()
+    T = upright_motion(np.array([0.0, 1.0, 0.0]))
+    views = [dataclasses.replace(view, T_world_camera=T @ view.T_world_camera) for view in VIEWS]
+    turned_room = move_gaussians(gaussians, T)
+    for up, views_of, shown, expected in (
+        ([0.0, 0.0, 1.0], VIEWS, gaussians, ""),
+        ([0.0, 1.0, 0.0], views, turned_room, "images show up as 0,0,1, not as 0,1,0;"),
+    ):
+        turn = np.eye(4) if not expected else T
+        content = MapContent(shown, shown, views=views_of, T_upright_map=turn, report={"up": up})
+        export(tmp_path, "nav2", content)
+        said = capsys.readouterr().err
+        assert ("its floor may be none" in said) == bool(expected)
+        assert expected in said
+
+
+def test_a_floor_that_is_seen_from_below_is_doubted(tmp_path, capsys):
+    gaussians, flip = room(), np.diag((1.0, -1.0, -1.0, 1.0))
+    views = [dataclasses.replace(view, T_world_camera=flip @ view.T_world_camera) for view in VIEWS]
+    axis = np.arange(-HALF_M, HALF_M, 0.05)
+    x, y = (values.ravel() for values in np.meshgrid(axis, axis))
+    level = gaussians.take(np.arange(len(x)) % len(gaussians))
+    level = dataclasses.replace(level, means_m=np.stack([x, y, np.zeros(len(x))], 1).astype(np.float32))
+    flipped = move_gaussians(level, flip)
+    for shown, seen_by, is_doubted in ((level, VIEWS, False), (flipped, views, True)):
+        export(tmp_path, "nav2", MapContent(shown, shown, views=seen_by))
+        assert ("more of it is free below" in capsys.readouterr().err) == is_doubted

@@ -1,5 +1,7 @@
 """A mesh of a flat surface lies on it, has its colour, and ends where the surface ends."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.render.map_viewer import view_map
-from gausslite_export.mesh import write_mesh
+from gausslite_export import formats
+from gausslite_export.format import ExportSettings, MapContent
+from gausslite_export.mesh import fitting_voxel_m, write_mesh
 
 VOXEL_M = 0.02
 
@@ -71,6 +75,18 @@ def test_mesh_needs_views_and_a_bounded_grid(tmp_path):
     gaussians = plane()
     with pytest.raises(InvalidInputError, match=r"keyframes\.json"):
         write_mesh(tmp_path / "m.ply", gaussians, [], view_map(gaussians).render, VOXEL_M)
-    with pytest.raises(InvalidInputError, match=r"--voxel, such as 0\.00\d"):
+    least_m = fitting_voxel_m(gaussians, 0.0004)
+    with pytest.raises(InvalidInputError, match=f"; use --voxel {least_m:g}$"):
         write_mesh(tmp_path / "m.ply", gaussians, views_from_above(), view_map(gaussians).render, 0.0004)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_default_voxels_grow_until_a_large_map_fits(tmp_path, capsys, monkeypatch):
+    sizes_m = []
+    monkeypatch.setattr(formats, "write_mesh", lambda *arguments: sizes_m.append(arguments[4]))
+    for scale in (1, 60):
+        gaussians = plane()
+        scaled = dataclasses.replace(gaussians, means_m=gaussians.means_m * np.float32(scale))
+        formats.MESH.write(tmp_path / "m.ply", MapContent(scaled, scaled), ExportSettings())
+    assert sizes_m[0] == formats.MESH_VOXEL_M < sizes_m[1] < 0.05
+    assert capsys.readouterr().err == f"mesh: voxels of {sizes_m[1]:g} m, the smallest that fit into memory\n"

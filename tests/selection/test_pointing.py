@@ -76,7 +76,7 @@ def wall(depth_m: float) -> Frame:
         ({"points_px": [(80, 10)]}, 1.0, "point 80,10: expected a pixel of the image of 80x60"),
         ({"points_px": [(-0.5, 10)]}, 1.0, "point -0.5,10: expected a pixel of the image of 80x60"),
         ({"points_px": [(float("nan"), 10)]}, 1.0, "point nan,10: expected a pixel of the image of 80x60"),
-        ({"points_px": [(4, 10)]}, 0.0, "point 4,10: expected a pixel with depth, frame 7 has none there"),
+        ({"points_px": [(4, 10)]}, 0.0, "point 4,10: expected depth, frame 7 has none there; draw a box"),
         ({"boxes_px": [(4, 4, 9, 9)]}, 0.0, "box 4,4,9,9: expected pixels with depth, frame 7 has none there"),
         ({"boxes_px": [(9, 4, 4, 9)]}, 1.0, "box 9,4,4,9: expected left,top,right,bottom in the image of 80x60"),
         ({}, 1.0, "points: expected at least one point or box, got none"),
@@ -86,6 +86,14 @@ def test_a_point_outside_the_image_or_without_depth_is_refused(prompt, depth_m, 
     with pytest.raises(InvalidInputError) as error:
         region_on_image(wall(depth_m), **prompt)
     assert str(error.value) == message
+
+
+def test_a_click_whose_region_has_much_of_the_image_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    mask_on_image(wall(0.5), points_px=[(40, 30)])
+    assert capsys.readouterr().err == ("point 40,30: its region has 100% of frame 7; if that is too much, draw a box\n")
+    mask_on_image(wall(4.0), points_px=[(40, 30)])
+    mask_on_image(wall(0.5), boxes_px=[(0, 0, 80, 60)])
+    assert capsys.readouterr().err == ""
 
 
 def test_a_point_that_no_frame_shows_is_refused() -> None:

@@ -7,6 +7,7 @@ import gausslite as gl
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite_language.rules import RuleParser
+from gausslite_mcp.context import relations_of
 from gausslite_selection.questions import answer
 
 
@@ -74,3 +75,19 @@ def test_the_up_axis_decides_what_is_on_the_table() -> None:
     sideways = [thing("table-1", (0.4, 0.0, 0.0), (0.8, 1.6, 0.8)), thing("mug-1", (0.85, 0.1, 0.0), (0.1, 0.1, 0.1))]
     assert not gl.ask(sideways, "what is on the table").objects
     assert gl.ask(sideways, "what is on the table", up_axis=(1.0, 0.0, 0.0)).objects == (sideways[1],)
+
+
+def test_small_things_side_by_side_are_near_and_none_is_on_the_other() -> None:
+    bottle = thing("bottle-1", (0.0, 0.0, 0.08), (0.05, 0.08, 0.16))
+    toy = thing("toy-1", (0.07, 0.0, 0.03), (0.08, 0.12, 0.06))
+    lid = thing("lid-1", (0.0, 0.0, 0.17), (0.05, 0.08, 0.02))
+    things = (bottle, toy, lid)
+    for question in ("what is near the bottle", "what is within 2 m of the bottle"):
+        assert gl.ask(things, question).objects == (toy, lid)
+    assert gl.ask(things, "what is on the bottle").objects == (lid,)
+    assert not gl.ask(things[:2], "what is on the toy").objects
+    assert relations_of(bottle, things, (0.0, 0.0, 1.0)) == {
+        "near": [{"id": "lid-1", "distance_m": 0.0}, {"id": "toy-1", "distance_m": pytest.approx(0.005)}],
+        "on": [],
+        "under": ["lid-1"],
+    }

@@ -18,12 +18,12 @@ from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.lens import Lens
-from gausslite.domain.pose import UpAxis, upward_axis
+from gausslite.domain.pose import UpAxis
 from gausslite.domain.relevance import Region
 
 FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 """Upward direction of a world that a level first view defines."""
-_LEVEL_COSINE, _AT_CEILING = 0.8, 0.7
+_LEVEL_COSINE = 0.8
 """Cameras without roll show up within about 20 degrees; rarely level ones within 37."""
 _ORIGIN_STEP_M = 10_000.0
 _EARTH_DIAMETER_M = 1.3e7
@@ -52,16 +52,16 @@ def estimate_up(
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
-def up_note(T_world_camera: Float64[ndarray, "n 4 4"], up_axis: UpAxis) -> str:
-    """Return the message on images that show another upward direction than this one; empty if they agree."""
-    shown = np.array(estimate_up(T_world_camera[:, :3, :3], up_axis))
-    # few views span no plane; but none looks at the ceiling all the time
-    if T_world_camera[:, :3, 2].sum(axis=0) @ up_axis > _AT_CEILING * len(T_world_camera):
-        shown = np.array(upward_axis(T_world_camera))
+def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) -> str:
+    """Return the message on images that show another up, which hardly turned ones do by their upper side, else ""."""
+    images, shown = "images", np.array(estimate_up(rotations_world_camera, up_axis))
     if shown @ up_axis > _LEVEL_COSINE:
-        return ""
+        _, down, ahead = rotations_world_camera.sum(axis=0).T / max(len(rotations_world_camera), 1)
+        if np.linalg.norm(down) < _LEVEL_COSINE or down @ up_axis < -_LEVEL_COSINE / 2 or ahead @ up_axis < -_LEVEL_COSINE:
+            return ""
+        images, shown = "upright images", -down / np.linalg.norm(down)
     stated, found = (",".join(f"{value + 0.0:.2g}" for value in np.round(axis, 2)) for axis in (up_axis, shown))
-    return f"the images show up as {found}, the layout as {stated}; 'on', heights and grids need it: state up={found}"
+    return f"{images} show up as {found}, not as {stated}; 'on', heights and grids need it: state up={found}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,15 +106,11 @@ class Origin:
 class FolderSource(Source):
     """Name, camera, upward direction and regions of a sequence in a folder."""
 
-    _camera: Camera
-    _lens: Lens | None
-    _camera_note: str
-    _unit_stated: bool
+    _found: FolderCamera
     _units: DepthUnits
     _up_axis: UpAxis
     _origin = Origin()
     _layout_has_registered_depth: bool
-    _stated_registered: bool | None = None
 
     def __init__(self, folder: Path) -> None:
         """Subclasses also call `_set_camera` and set `_up_axis`."""
@@ -122,9 +118,7 @@ class FolderSource(Source):
 
     def _set_camera(self, found: FolderCamera, default_units: DepthUnits) -> None:
         """Use this camera and its depth units, if it states them."""
-        self._camera, self._lens, self._camera_note = found.camera, found.lens, found.note
-        self._unit_stated = found.units_per_metre is not None
-        self._stated_registered = found.depth_registered
+        self._found = found
         self._units = replace(default_units, per_metre=found.units_per_metre or default_units.per_metre)
 
     @property
@@ -140,17 +134,17 @@ class FolderSource(Source):
     @property
     def notes(self) -> tuple[str, ...]:
         """Messages on a camera file of another folder, on excluded frames, and on an origin that is not zero."""
-        return tuple(filter(None, (self._camera_note, self.excluded_frames, self._origin.note)))
+        return tuple(filter(None, (self._found.note, self.excluded_frames, self._origin.note)))
 
     @property
     def camera(self) -> Camera:
         """Camera at the size of the recorded images."""
-        return self._camera
+        return self._found.camera
 
     @property
     def lens(self) -> Lens | None:
         """Lens that is stated for the camera, else None."""
-        return self._lens
+        return self._found.lens
 
     @property
     def up_axis(self) -> UpAxis:
@@ -160,13 +154,13 @@ class FolderSource(Source):
     @property
     def depth_registered(self) -> bool:
         """What the camera's file states, else what the layout guarantees."""
-        stated = self._stated_registered
+        stated = self._found.depth_registered
         return self._layout_has_registered_depth if stated is None else stated
 
     @property
     def depth_unit_stated(self) -> bool:
         """True if a camera file states it."""
-        return self._unit_stated
+        return self._found.units_per_metre is not None
 
     @property
     def depth_unit_setting(self) -> str:

@@ -111,7 +111,7 @@ class TumSource(FolderSource):
         """Return the frame at position i. Raises DatasetError."""
         require_position(self.name, i, len(self))
         match = self._matches[i]
-        image = load_rgbd(match.colour, match.depth, self._camera, self._units, size)
+        image = load_rgbd(match.colour, match.depth, self.camera, self._units, size)
         return image.frame(match.number, round(match.time_s * 1e9), match.T_world_camera)
 
     def indices(self) -> Sequence[int]:

@@ -19,6 +19,7 @@ from gausslite.domain.voxels import AxisAlignedBox
 
 MAX_OBJECTS_PER_AGENT = 200
 MAX_OBJECT_COORDINATE_M = 1e6
+POINTING = "point at it (--set view=8099, or target-at=X,Y,Z,R without --task)"
 _MAX_TIME_NS = 1 << 62
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 
@@ -64,7 +65,7 @@ class NounMatch:
         """Return why the noun cannot be found or may be a different thing; None if it is searched as itself."""
         if self.basis is MatchBasis.NONE:
             nearest = f" (near in meaning: {', '.join(map(repr, self.known))})" if self.known else ""
-            return f"no class of the detector matches {self.noun!r}{nearest}; point at it, or prompt a detector by text"
+            return f"no class of the detector matches {self.noun!r}{nearest}; {POINTING}, or prompt a detector by text"
         if self.basis is MatchBasis.REGION and not self.classes:
             if not self.known:
                 return f"nothing searches {self.noun!r}: there is no detector"
@@ -116,12 +117,12 @@ class NounReport:
 
     def _unseen(self) -> str:
         if self.best_frame is None:
-            return "not seen so far; point at it if a frame shows it"
+            return f"not seen so far; if a frame shows it, {POINTING}"
         seen, least = f"seen in frame {self.best_frame} with {self.best_score:.2f}", self.match.min_score
         if least is None or self.best_score >= least:
-            return f"{seen}, but too large, without depth, or enlarged only: a lower min-score may do, or point at it"
+            return f"{seen}, but too large, without depth, or enlarged only: a lower min-score may do, or {POINTING}"
         key = max(1, math.floor(80 * self.best_score)) / 100
-        return f"{seen} (threshold {least:.2f}): --set min-score={key:g}, or point at it"
+        return f"{seen} (threshold {least:.2f}): --set min-score={key:g}, or {POINTING}"
 
 
 def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:

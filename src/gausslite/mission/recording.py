@@ -80,7 +80,7 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
     if up_axis is None and require_poses and not source.poses_exact:
         # `frame` reports a damaged pose if it is used
         with suppress(DatasetError, PoseError):
-            if note := up_note(source.trajectory().T_world_camera, source.up_axis):
+            if note := up_note(source.trajectory().T_world_camera[:, :3, :3], source.up_axis):
                 print_message(f"{spec}: {note}")
     return source
 

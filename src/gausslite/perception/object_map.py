@@ -135,7 +135,7 @@ class Landmark:
     measured: Measured | None = None  # its attributes so far
 
     @classmethod
-    def from_observation(cls, observation: Observation) -> Landmark:
+    def from_observation(cls, observation: Observation) -> Self:
         """Return a landmark of one observation."""
         return cls(
             phrase=observation.phrase,

@@ -10,6 +10,7 @@ from tiny_sequences import write_seven_scenes, write_tum
 from gausslite.cli.main import main
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.calibration import Calibration
+from gausslite.datasets.folder import up_note
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
@@ -118,6 +119,12 @@ def test_images_that_show_another_upward_direction_are_reported(
     rows = [f"{9.9 + i / 100:.3f} 0 0 0 0 {np.sin(a):.9f} 0 {np.cos(a):.9f}" for i, a in enumerate(yaws)]
     (folder / "groundtruth.txt").write_text("\n".join(rows))
     assert open_recorded(str(folder), None).up_axis == (0.0, 0.0, 1.0)
-    assert "the images show up as 0,-1,0, the layout as 0,0,1;" in capsys.readouterr().err
+    assert "fr1: images show up as 0,-1,0, not as 0,0,1;" in capsys.readouterr().err
+    # images that hardly turn are taken as upright, unless they look down
+    for rotation, message in (
+        (np.eye(3), "upright images show up as 0,-1,0, not as 0,0,1; 'on', heights and grids need it: state up=0,-1,0"),
+        (np.diag((1.0, -1.0, -1.0)), ""),
+    ):
+        assert up_note(np.array([rotation] * 5), (0.0, 0.0, 1.0)) == message
     open_recorded(str(folder), (0.0, -1.0, 0.0))
     assert "up" not in capsys.readouterr().err

@@ -9,7 +9,7 @@ from observed_objects import ObservedObjects
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import MatchBasis
+from gausslite.domain.objects import POINTING, MatchBasis
 from gausslite.domain.relevance import NO_TARGET, BallRegion
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.detector import RegionDetector
@@ -279,7 +279,7 @@ def test_a_noun_without_a_class_is_refused_with_the_nearest_names(noun):
     assert not match.is_searched
     assert (match.basis, match.classes) == (MatchBasis.NONE, ())
     assert f"no class of the detector matches {noun!r}" in match.warning
-    assert (noun != "shoe") or "(near in meaning: 'Sandal'); point at it, or" in match.warning
+    assert (noun != "shoe") or f"(near in meaning: 'Sandal'); {POINTING}, or" in match.warning
 
 
 def test_only_classes_near_in_meaning_are_offered():

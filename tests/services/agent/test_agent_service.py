@@ -30,6 +30,7 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel
+from gausslite.domain.objects import POINTING
 from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import BallRegion, PointedObject
 from gausslite.domain.task import TargetRole, TaskGraph
@@ -59,7 +60,7 @@ def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
         searched, unsupported, not_seen, lost = a.client.status().notes
     assert assigned.warnings == (lost, "no region matches 'table'; the regions are mug_1")
     assert lost == "'victim' is not part of the task"
-    assert searched == "'mug' is searched as 'mug_1' (ground truth): not seen so far; point at it if a frame shows it"
+    assert searched == f"'mug' is searched as 'mug_1' (ground truth): not seen so far; if a frame shows it, {POINTING}"
     assert unsupported.startswith("no region matches 'table'")
     assert not_seen.startswith("no class of the detector is a 'table': the height of what an object stands on decides")
 
