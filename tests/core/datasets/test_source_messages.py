@@ -119,7 +119,7 @@ def test_images_that_show_another_upward_direction_are_reported(
     rows = [f"{9.9 + i / 100:.3f} 0 0 0 0 {np.sin(a):.9f} 0 {np.cos(a):.9f}" for i, a in enumerate(yaws)]
     (folder / "groundtruth.txt").write_text("\n".join(rows))
     assert open_recorded(str(folder), None).up_axis == (0.0, 0.0, 1.0)
-    assert "fr1: images show up as 0,-1,0, not as 0,0,1;" in capsys.readouterr().err
+    assert "images show up as 0,-1,0, not as 0,0,1;" in capsys.readouterr().err
     # images that hardly turn are taken as upright, unless they look down
     for rotation, message in (
         (np.eye(3), "upright images show up as 0,-1,0, not as 0,0,1; 'on', heights and grids need it: state up=0,-1,0"),
