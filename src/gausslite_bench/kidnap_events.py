@@ -88,6 +88,7 @@ class KidnapSettings:
         tuple(EVENTS), f"among {', '.join(EVENTS)}", metavar="A,B", convert=names_among(EVENTS)
     )
     objects: tuple[str, ...] = option((), "of the task's region in the recording (default: no region)", metavar="A,B")
+    robots: int = option(1, "2: a teammate maps the same place, and a server fuses both maps", low=1, high=2)
     frames: int = option(48, "frames before the event", low=4)
     after: int = option(16, "frames after it", low=2)
     stride: int = option(1, "every n-th frame of the recording", low=1)
@@ -112,6 +113,11 @@ class Recording:
                     f"{source.name}: expected at least {needed} frames, got {len(source)}; "
                     "use fewer --frames, --after or a smaller --stride"
                 )
+
+    def teammate(self) -> Frames:
+        """Return the frames of another robot: from the middle before an event to the last ones that follow."""
+        first, end = self.settings.frames // 2, self.settings.frames + self.settings.after
+        return self._frames(self.source, range(first, end), 0)
 
     def mission_settings(self, has_region: bool) -> MissionSettings:
         """Return the settings of each mission."""

@@ -20,6 +20,7 @@ from gausslite.mission.task_mapper import TaskMapper
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.kidnap_events import EVENTS, Event, Frames, KidnapSettings, Poses, Recording
 from gausslite_bench.report import Report
+from gausslite_bench.team.kidnapped import TeamTrials
 from gausslite_evaluation.compare import evaluate
 from gausslite_evaluation.views import HeldOutView
 from gausslite_relocalisation.monitor import FrameMonitor
@@ -90,8 +91,8 @@ def _after_event(
 class _Trials:
     """The missions of a recording; those of the same frames at their own poses are mapped once."""
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording, self._before = recording, recording.before()
+    def __init__(self, recording: Recording, before: Frames) -> None:
+        self._recording, self._before = recording, before
         objects = recording.settings.objects
         self._regions = choose_regions(recording.source.regions(), objects) if objects else []
         self._references: dict[str, dict[str, float | None]] = {}
@@ -150,11 +151,17 @@ def run_kidnaps(settings: KidnapSettings) -> Report:
     wrong: frames that are mapped at a wrong pose, wrong_gs: Gaussians that these add. psnr: of the frames before it.
     """
     recording = Recording(open_source(settings.source), open_source(settings.elsewhere), settings)
-    trials, rows = _Trials(recording), []
+    before = recording.before()
+    trials, team = _Trials(recording, before), TeamTrials(recording, before) if settings.robots > 1 else None
+    rows, of_team = [], []
     with progress_bar(2 * len(settings.events), "kidnaps", "mission") as progress:
         for name in settings.events:
             for is_watched in (True, False):
                 rows.append(trials.run(name, is_watched))
+                if team is not None:
+                    of_team.append(team.run(name, is_watched))
                 progress.update()
     faults = ("false_alarms", "false_places")
-    return Report({"events": rows}, is_good=not any(row[fault] for row in rows for fault in faults))
+    quarantined = any(row["watched"] and row["quarantined"] for row in of_team)
+    is_good = not quarantined and not any(row[fault] for row in rows for fault in faults)
+    return Report({"events": rows} | ({"team": of_team} if of_team else {}), is_good)
