@@ -57,7 +57,8 @@ def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) 
     images, shown = "images", np.array(estimate_up(rotations_world_camera, up_axis))
     if shown @ up_axis > _LEVEL_COSINE:
         _, down, ahead = rotations_world_camera.sum(axis=0).T / max(len(rotations_world_camera), 1)
-        if np.linalg.norm(down) < _LEVEL_COSINE or down @ up_axis < -_LEVEL_COSINE / 2 or ahead @ up_axis < -_LEVEL_COSINE:
+        level = _LEVEL_COSINE
+        if np.linalg.norm(down) < level or down @ up_axis < -level / 2 or ahead @ up_axis < -level:
             return ""
         images, shown = "upright images", -down / np.linalg.norm(down)
     stated, found = (",".join(f"{value + 0.0:.2g}" for value in np.round(axis, 2)) for axis in (up_axis, shown))
