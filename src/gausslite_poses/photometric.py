@@ -47,7 +47,7 @@ _NUISANCE_STD = 1.0
 """Prior of the global gain and offset that are fitted along with the pose and then dropped."""
 _CONVERGED = 1e-4
 """A level ends when the pose changes by less than this, in metres and radians."""
-_FIT_STD_PX = 0.1
+_FIT_STD_PX = 0.2
 """Error of the fit itself on a map that still grows, at the median depth: a larger image gives a better fit.
 
 `shrinkage` leaves a part of every true correction undone, so this must stay small.
