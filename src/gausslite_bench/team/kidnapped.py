@@ -5,6 +5,8 @@ from __future__ import annotations
 from itertools import zip_longest
 from typing import Any
 
+import numpy as np
+
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import BallRegion
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel
@@ -80,7 +82,7 @@ class TeamTrials:
                 if frame is not None:
                     mission.process(frame)
             engine.align_due()
-            quarantined |= {each for each in (_ROBOT, _MATE) if not engine.frames.get(each).is_used}
+            quarantined |= {agent_id for agent_id in (_ROBOT, _MATE) if not engine.frames.get(agent_id).is_used}
         fused = engine.maps.voted_map().gaussians
         mapped = set(robot.poses.state()["frames"][:, 0].tolist())
         tracked = [frame for frame in (*before, *(after if event.is_known else ())) if frame.index in mapped]
@@ -88,10 +90,10 @@ class TeamTrials:
         return {
             "event": name,
             "watched": is_watched,
-            "frames": ", ".join(str(engine.frames.get(each).state) for each in (_ROBOT, _MATE)),
+            "frames": ", ".join(str(engine.frames.get(agent_id).state) for agent_id in (_ROBOT, _MATE)),
             "quarantined": len(quarantined),
             "gaussians": len(fused),
-            "away": float((Surface(offline.means_m).nearest(fused.means_m)[1] > _AWAY_M).mean()),
+            "away": float((Surface(offline.means_m).nearest(fused.means_m.astype(np.float64))[1] > _AWAY_M).mean()),
             "psnr": self._psnr(fused),
             "psnr_offline": self._psnr(offline),
         }
