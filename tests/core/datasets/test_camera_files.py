@@ -101,8 +101,8 @@ def test_a_camera_file_one_folder_above_is_named(
     assert open_recorded(".", None).camera.fx_px == 21.0
     assert f"the camera is that of {above}" in capsys.readouterr().err
     write_json(folder / "cam_params.json", fx=22.0)
-    assert open_recorded(str(folder), None).camera.fx_px == 22.0
-    assert "the camera is that of" not in capsys.readouterr().err
+    assert open_recorded(str(folder), (0.0, -1.0, 0.0)).camera.fx_px == 22.0
+    assert capsys.readouterr().err == ""
 
 
 def test_a_camera_file_above_for_images_of_another_size_is_not_used(tmp_path: Path) -> None:
