@@ -333,7 +333,8 @@ class DiskPager(MapPager):
             means_m = table.means_m.astype(np.float64)
             reach_m = _REACH_PER_SCALE * np.exp(table.rows[:, LOG_SCALE].max())
             bounds_m = np.stack([means_m.min(axis=0) - reach_m, means_m.max(axis=0) + reach_m])
-            self._parts[i] = _Part(part.tile, part.count, page, self._corrected, self._tasks, bounds_m, part.anchors)
+            stored = replace(part, page=page, corrections=self._corrected, tasks=self._tasks)
+            self._parts[i] = replace(stored, bounds_m=bounds_m)
         self._forget_corrections()
 
     def _forget_corrections(self) -> None:

@@ -250,9 +250,8 @@ def fit_pose(
     solution = _solve(model, frame, REFINEMENT, T_rendered_odometry, prior_std)
     assert solution is not None
     deviation = twist_of(solution.T_camera_rendered @ T_rendered_odometry)
-    fit_std_rad = _FIT_STD_PX / frame.camera.fx_px
-    deviation[:3] *= shrinkage(prior_std[0], fit_std_rad * float(np.median(model.points[:, 2])))
-    deviation[3:] *= shrinkage(prior_std[3], fit_std_rad)
+    for part, depth_m in ((slice(3), float(np.median(model.points[:, 2]))), (slice(3, 6), 1.0)):
+        deviation[part] *= shrinkage(prior_std[part][0], frame.camera.length_m(_FIT_STD_PX, depth_m))
     T_world_camera: Float64[ndarray, "4 4"] = frame.T_world_camera @ inverse(transform_of(deviation))
     return T_world_camera
 

@@ -42,7 +42,7 @@ def test_good_agents_are_measured_beside_an_attack(capsys: pytest.CaptureFixture
 
 
 def test_a_message_is_split_into_its_stages() -> None:
-    assert set(stages_ms(2)) == {"decode", "check", "store", "vote", "acknowledge"}
+    assert set(stages_ms(2)) == {"decode", "check", "store", "vote"}
 
 
 def test_a_team_above_the_default_quota_has_room() -> None:

@@ -72,7 +72,7 @@ def test_a_larger_image_leaves_less_of_a_correction_undone() -> None:
     for scale in (1, 4):
         true = wall_frame(size=(96 * scale, 72 * scale))
         wrong = displaced(true, 0.005, 0.0)
-        T_world_camera = fit_pose(rendering_like(true), inverse(true.T_world_camera), wrong, PoseExposurePrior(0.001))
+        T_world_camera = fit_pose(rendering_like(true), inverse(true.T_world_camera), wrong, PoseExposurePrior(0.002))
         kept.append(translation_m(T_world_camera, wrong.T_world_camera) / 0.005)
     assert kept[0] < 0.4
     assert kept[1] > 0.6

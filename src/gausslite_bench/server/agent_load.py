@@ -80,7 +80,7 @@ class AgentLoad:
         later_s = [own_s for index, own_s in times_s if index >= RATE_HZ] or [np.nan]
         later_p99_ms = 1000 * float(np.percentile(later_s, 99))
         total = agents * count
-        return LoadResult(agents, total, p50_ms, p99_ms, total - len(times_s), refused, later_p99_ms)
+        return LoadResult(agents, total, p50_ms, p99_ms, total - len(times_s), refused, later_p99_ms=later_p99_ms)
 
     async def _send(self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]) -> tuple[_Times, int]:
         times_s: _Times = []

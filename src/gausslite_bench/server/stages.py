@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import tempfile
 import time
 from collections.abc import Sequence
@@ -19,11 +18,8 @@ from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.update_log import PutOutcome
 from gausslite.fusion.updates import MissionClock, UpdateChecks
-from gausslite.wire.call_limits import RejectionLog
-from gausslite.wire.security import Caller
 from gausslite_bench.async_calls import update_request
 from gausslite_bench.server.synthetic_updates import GRID, PATCHES, delta_messages
-from gausslite_fusion_server.contributions import Acknowledger, StoredCount
 
 
 class _TimedStore(SqliteStore):
@@ -47,7 +43,6 @@ def stages_ms(agents: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder, closing(_TimedStore(Path(folder) / "store.sqlite")) as store:
         settings = FusionSettings(grid=GRID, quotas=Quotas(agents=agents))
         engine, checks = FusionEngine(store, settings), UpdateChecks(store, settings.quotas, MissionClock(store))
-        stream = Acknowledger(Caller("unix"), engine.traffic, RejectionLog(logging.getLogger(__name__)))
         sessions = [engine.join(name, MissionConfig("", "", GRID.size_m)).session for name in names]
         sent = [own for subsets in zip(*messages, strict=True) for own in zip(sessions, subsets, strict=True)]
         times_s: list[ndarray] = []
@@ -62,11 +57,8 @@ def stages_ms(agents: int) -> dict[str, float]:
             stamps_s.append(time.thread_time())
             put = engine.enqueue_update(session, subset)
             engine.commit_updates()
-            counts = StoredCount(len(put.result().accepted), len(put.result().stale))
-            stamps_s.append(time.thread_time())
-            stream.accept(request, session.agent_id, counts).SerializeToString()
+            assert len(put.result().accepted)
             times_s.append(np.diff([*stamps_s, time.thread_time()]))
-        decode, check, commit, acknowledge = (1000 * np.mean(times_s, axis=0)).tolist()
+        decode, check, commit = (1000 * np.mean(times_s, axis=0)).tolist()
         in_store = 1000 * store.cpu_s / len(times_s)
-    vote = commit - check - in_store
-    return {"decode": decode, "check": check, "store": in_store, "vote": vote, "acknowledge": acknowledge}
+    return {"decode": decode, "check": check, "store": in_store, "vote": commit - check - in_store}
