@@ -100,11 +100,14 @@ def test_matches_come_from_a_process_that_is_started_again_when_it_has_grown_or_
     a, _, _ = _views((0.6, 0.8, 20), (0.7, 1.4, -5))
     # two clouds that are the same have the most matches, which the library never frees
     found, processes = [], set()
-    for call in range(12):
+    for call in range(100):
         found.append(matched_motion(_surface(a), _surface(a)))
         assert MATCHER._process is not None
         processes.add(MATCHER._process.pid)
         if call == 1:
             MATCHER._process.kill()
-    assert [T is not None and np.allclose(T, np.eye(4), atol=1e-3) for T in found] == [True] * 12
+        # how much it keeps of a call varies: after the killed one, one ends by its growth
+        if len(processes) > 2:
+            break
+    assert all(T is not None and np.allclose(T, np.eye(4), atol=1e-3) for T in found)
     assert len(processes) > 2
