@@ -605,7 +605,9 @@ class GetCameraViewResponse(_message.Message):
     def t_world_camera(self) -> _geometry_pb2.RigidTransform: ...
     @_builtins.property
     def path(self) -> _containers.RepeatedCompositeFieldContainer[Global___StampedPose]:
-        """Poses of the mapped frames in the map, oldest first; at most 1000, evenly spaced over the mission."""
+        """Poses of the mapped frames in the map, oldest first; at most 1000, evenly spaced over the mission.
+        Where the camera's clock was set, the times go on as before.
+        """
 
     @_builtins.property
     def keyframes(self) -> _containers.RepeatedCompositeFieldContainer[_geometry_pb2.RigidTransform]:
