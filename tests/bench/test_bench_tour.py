@@ -80,6 +80,7 @@ def test_events_are_at_visits_of_the_tour(events: dict[str, tuple[int, ...]], me
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_tour_with_all_events_returns_to_a_home_that_was_on_disk(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (
         "--homes 3 --laps 2 --frames 40 --width 160 --iterations 2 --max-gaussians 15000 --disk-mb 50 --json "
