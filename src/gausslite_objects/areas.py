@@ -27,6 +27,7 @@ _FILE, CARRIED_AREAS = "areas.json", "areas"
 _MAX_AREAS, _MAX_CORNERS = 200, 200
 _STOREY_M = (-0.3, 2.7)
 """Heights above the floor that belong to an area; another storey does not."""
+_SETTLED_M = 0.02
 _BEFORE: Final = r"(?:^|\b(?:in|inside|at|within|from|(?P<out>not (?:in|inside|at)|outside(?: of)?|out of))\s+)"
 _AFTER: Final = r"(?=\s*(?:$|[?.,!]|(?:on|near|and|or|that|which|with|is|are|there|by|next|under|beside|behind|in)\b))"
 """Around the name of an area: the kitchen table is no place in the kitchen."""
@@ -97,6 +98,17 @@ def with_area(areas: Iterable[Area], area: Area) -> tuple[Area, ...]:
     if len(others) >= _MAX_AREAS:
         raise InvalidInputError(f"areas: expected at most {_MAX_AREAS}, got more")
     return (*others, area)
+
+
+def settled(areas: Iterable[Area], known: Sequence[Area]) -> tuple[Area, ...]:
+    """Return the areas; for one that has hardly moved the known one, as a robot's frame is fitted again and again."""
+    return tuple(next((own for own in known if _is_close(own, area)), area) for area in areas)
+
+
+def _is_close(one: Area, other: Area) -> bool:
+    if (one.name, len(one.corners_m)) != (other.name, len(other.corners_m)):
+        return False
+    return np.allclose(one.corners_m, other.corners_m, rtol=0.0, atol=_SETTLED_M)
 
 
 def joined(own: Sequence[Area], others: Iterable[Area]) -> tuple[Area, ...]:

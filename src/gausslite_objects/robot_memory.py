@@ -26,7 +26,7 @@ from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.wire.server import Service
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.settings import AgentSettings
-from gausslite_objects.areas import Area, read_areas, write_areas
+from gausslite_objects.areas import Area, read_areas, settled, write_areas
 from gausslite_objects.edits import Edit, EditedObjects, apply_edits, read_edits, write_edits
 from gausslite_objects.light_objects import LightObjects
 from gausslite_objects.memory_client import MemoryClient, area_from_message
@@ -112,9 +112,12 @@ class RobotPlace:
         self._change(lambda memory: memory.change(memory.edits, own, team))
 
     def follow_team(self, areas: tuple[Area, ...]) -> None:
-        """Replace the areas of the team, once there is a task that may name one. Raises StorageError."""
-        if self._worker.status().graph is not None and areas != self._memory.team_areas:
-            self._change(lambda memory: memory.change(memory.edits, memory.areas, areas))
+        """Replace the areas of the team, once there is a task that may name one; the next saved state has them."""
+        if self._worker.status().graph is None:
+            return
+        memory = self._memory
+        if (now := settled(areas, memory.team_areas)) != memory.team_areas:
+            self._worker.change_objects(lambda: memory.change(memory.edits, memory.areas, now)).result()
 
     def objects(self) -> EditedObjects:
         """Return the robot's objects after all edits."""

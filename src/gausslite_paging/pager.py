@@ -46,11 +46,12 @@ _REACH_PER_SCALE = 5.0
 """A splat touches pixels up to 3.33 standard deviations from its mean; beside the image of a wide camera, up to 4.5."""
 _REACH_MARGIN = 1.1
 _STORES_PER_RETURN = 16
-"""So often memory that was freed goes back to the system, which takes milliseconds: a map of any size leaves holes."""
+"""Each time that this many parts have left memory, what was freed goes back to the system; that takes milliseconds."""
 _DEPTH_STEP_PX = 4
 _PART_NUMBERS = 8
 _MAX_CORRECTIONS = 32
-"""By loops that wait for what is on disk: of an hour's map each takes 200 kB, and widens the bounds of all parts."""
+"""So many corrections by loops may wait for the parts on disk: each takes 200 kB in an hour's map, and widens the
+bounds of all parts."""
 
 
 def _row_type(table: SplatTable) -> np.dtype[np.void]:

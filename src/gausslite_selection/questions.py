@@ -134,7 +134,7 @@ class _BoxSelector(AttributeSelector):
 
 
 def is_on(one: MappedLandmark, other: MappedLandmark, up: Float64[ndarray, "3"]) -> bool:
-    """Return True for an object over another, unless it stands beside it.
+    """Return True for an object over another, unless it is beside it.
 
     That is, it begins below the middle of the other's height, and less than half of the smaller footprint is shared.
     """
