@@ -173,11 +173,10 @@ def test_the_ablation_table_has_one_row_per_component_and_both_budgets() -> None
 
 
 def test_a_curve_that_falls_is_named() -> None:
-    steps = {
-        str(iterations): StudyResults([finished(TASK, 0, psnr_db, TrialBudget(iterations=iterations))])
-        for iterations, psnr_db in ((8, 26.0), (32, 26.5), (128, 25.9))
-    }
-    found = curves(steps)
+    steps = {"8": 26.0, "32": 26.5, "128": 25.9}
+    budgets = [TrialBudget(iterations=int(step)) for step in steps]
+    one_study = [finished(TASK, 0, own, budget) for own, budget in zip(steps.values(), budgets, strict=True)]
+    found = curves([(StudyResults(one_study), budget) for budget in budgets])
     assert [(curve.metric, curve.falls) for curve in found] == [(ROI_PSNR.title, True), (FULL_PSNR.title, False)]
     table = growth_table("iterations", list(steps), found)
     assert "| 26.00 | 26.50 | 25.90 | **0.60** |" in table

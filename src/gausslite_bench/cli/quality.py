@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar, progress_bar
@@ -69,10 +69,11 @@ class _AblationOptions:
     equal: str = option(_BOTH, _EQUAL_HELP, choices=_EQUAL)
 
 
+_FRAMES = "frames"
 _GROWTH_STEPS = {
     "iterations": ("4", "8", "16", "32", "64", "128"),
     "rate": ("8", "4", "2", "1"),
-    "frames": ("15", "30", "60", "120"),
+    _FRAMES: ("15", "30", "60", "120"),
     "max-gaussians": ("10000", "30000", "100000", "300000"),
 }
 """The quantities that may grow, and the default steps; a lower rate gives a frame more time."""
@@ -110,10 +111,14 @@ def run_compute(options: argparse.Namespace) -> int:
     # wrong values fail here, before hours of work
     stepped = {step: _with_step(options, chosen.quantity, step) for step in steps}
     studies = {step: _study(own, chosen.pairs, (_ABLATION_TASK,), variants) for step, own in stepped.items()}
-    results = {step: _run(stepped[step], study) for step, study in studies.items()}
-    found = curves(results)
+    budgets = [study.budgets[0] for study in studies.values()]
+    if chosen.quantity == _FRAMES:
+        results = [_run(stepped[step], study) for step, study in studies.items()]
+    else:  # one study of several budgets, which makes a scene's images once
+        results = [_run(stepped[steps[0]], replace(studies[steps[0]], budgets=budgets))] * len(steps)
+    found = curves(list(zip(results, budgets, strict=True)))
     table = growth_table(chosen.quantity, steps, found)
-    trials = [trial for step in results.values() for trial in step.trials_as_json()]
+    trials = [trial for one in dict.fromkeys(results) for trial in one.trials_as_json()]
     write_results(options.out, "compute", table, trials)
     write_atomic(options.out / "compute.svg", growth_plot(steps, found).encode())
     print(f"{table}→ {options.out / 'compute.md'}, compute.svg")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise, product
 from statistics import fmean
 
 from gausslite_bench.quality.tables import FULL_PSNR, ROI_PSNR, StudyResults, markdown
+from gausslite_bench.quality.trials import TrialBudget
 
 _TOLERATED_FALL_DB = 0.1
 _WIDTH, _HEIGHT, _MARGIN = 480.0, 200.0, 40.0
@@ -35,12 +36,12 @@ class Curve:
         return self.largest_fall_db > _TOLERATED_FALL_DB
 
 
-def curves(steps: Mapping[str, StudyResults]) -> list[Curve]:
-    """Return the curve of each scene, metric and policy. steps: the results by the value of the quantity, ascending."""
-    first = next(iter(steps.values()))
+def curves(steps: Sequence[tuple[StudyResults, TrialBudget]]) -> list[Curve]:
+    """Return the curve of each scene, metric and policy. steps: the results and the budget of each step, ascending."""
+    first, _ = steps[0]
     found = []
     for scene, metric, policy in product(first.scenes, (ROI_PSNR, FULL_PSNR), first.variants):
-        values = [step.values(scene, policy, metric, step.budgets[0]) for step in steps.values()]
+        values = [results.values(scene, policy, metric, budget) for results, budget in steps]
         if all(values):
             found.append(Curve(scene, policy, metric.title, [fmean(own) for own in values]))
     return found
