@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_sequences import write_seven_scenes
+from tiny_sequences import write_replica, write_seven_scenes
 
 from gausslite.cli.main import main
 from gausslite_bench.team.scenes import HomeTeamPlan
@@ -57,3 +57,18 @@ def test_parts_of_a_recording_make_a_team(tmp_path: Path, capsys: pytest.Capture
     assert trial["scene"] == "wall-cup x 2"
     assert 5 < trial["roi_psnr"]["vote"] < 60
     assert set(trial["alignment"]) == {"agent-0", "agent-1"}
+
+
+@pytest.mark.slow
+def test_a_folder_of_recordings_in_replicas_layout_is_a_team(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robots = [write_replica(tmp_path / "Office-0" / f"office_0_part{i}", 9) for i in (1, 2)]
+    voxels = np.stack(np.meshgrid(range(-4, 4), range(-4, 4), [9, 10], indexing="ij"), axis=-1).reshape(-1, 3)
+    np.savez(robots[0].parent / "roi_voxels.npz", voxel_size_m=0.1, cup_1=voxels.astype(np.int32))
+    budget = ["--max-gaussians", "300", "--iterations", "2", "--refine-iterations", "2", "--threads", "1"]
+    arguments = ["bench", "team", "--real", str(robots[0].parent), "--size", "24x18", *budget]
+    assert main([*arguments, "--policies", "task", "--json", "--out", str(tmp_path / "out")]) == 0
+    [trial] = json.loads(capsys.readouterr().out)["trials"]
+    assert trial["scene"] == "office_0_part1-cup x 2"
+    assert trial["roi_psnr"]["vote"] > 5

@@ -82,10 +82,15 @@ def _reader_of(spec: str) -> SourceReader | None:
     return next((reader for reader in _readers() if reader.recognises(spec)), None)
 
 
+def sequences_inside(folder: Path) -> list[tuple[SourceReader, Path]]:
+    """Return the folders in a folder that hold a sequence, by name, and their readers."""
+    folders = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    return [(reader, path) for path in folders if (reader := _reader_of(str(path))) is not None]
+
+
 def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
     """Return the only sequence in a folder, and its reader. Raises DatasetError for none and for several."""
-    folders = [path for path in sorted(folder.iterdir()) if path.is_dir()]
-    inside = [(reader, path) for path in folders if (reader := _reader_of(str(path))) is not None]
+    inside = sequences_inside(folder)
     if len(inside) == 1:
         [(reader, path)] = inside
         return reader, str(path)

@@ -71,7 +71,11 @@ class StudyOptions:
 class RealOptions:
     """A real sequence in place of the simulated homes, or beside them."""
 
-    real: Path | None = option(None, "measure on this sequence; on homes too if they are named", metavar="FOLDER")
+    real: Path | None = option(
+        None,
+        "measure on this sequence (`bench team`: or on one for each robot, in this folder); on homes too if named",
+        metavar="FOLDER",
+    )
     roi: Path | None = option(
         None, f"its regions; one task per kind of object (default: FOLDER/{REGIONS_FILE})", metavar="FILE.npz"
     )

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.config.option import build, option
+from gausslite.datasets.open import sequences_inside
+from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import prepare_folder
 from gausslite.mission.settings import MissionSettings
@@ -19,6 +21,7 @@ from gausslite_bench.cli.study_options import (
     study_command,
     write_results,
 )
+from gausslite_bench.quality.real_scenes import RealScenePlan
 from gausslite_bench.team.bench import TeamResult, TeamTrial, run_trial
 from gausslite_bench.team.scenes import HomeTeamPlan, RecordingTeamPlan, TeamPlan
 from gausslite_bench.team.tables import team_table
@@ -69,6 +72,11 @@ def _plans(options: argparse.Namespace) -> tuple[list[TeamPlan], tuple[int, int]
     plans: list[TeamPlan] = [
         HomeTeamPlan(home, agents, frames, team.views) for home in homes for agents in team.team_sizes
     ]
+    robots = _robots_plans(options, chosen.frames)
+    if robots:
+        kinds, size = robots[0]
+        plans.append(RecordingTeamPlan(tuple(kinds), len(robots), tuple(own[0] for own, _ in robots)))
+        return plans, chosen.size or size
     real = real_sequence_plans(options, None)
     if real is None:
         return plans, chosen.size or DEFAULT_SIZE
@@ -77,6 +85,16 @@ def _plans(options: argparse.Namespace) -> tuple[list[TeamPlan], tuple[int, int]
         of_all = None if chosen.frames is None else agents * chosen.frames
         plans.append(RecordingTeamPlan(tuple(replace(kind, frames=of_all) for kind in kinds), agents))
     return plans, chosen.size or size
+
+
+def _robots_plans(options: argparse.Namespace, frames: int | None) -> list[tuple[list[RealScenePlan], tuple[int, int]]]:
+    """Return the plans and the image size of each robot, if the folder holds several recordings; empty otherwise."""
+    inside = sequences_inside(options.real) if options.real is not None and options.real.is_dir() else []
+    if len(inside) < 2:
+        return []
+    regions = options.roi or options.real / REGIONS_FILE
+    robots = [argparse.Namespace(**{**vars(options), "real": path, "roi": regions}) for _, path in inside]
+    return [plans for robot in robots if (plans := real_sequence_plans(robot, frames)) is not None]
 
 
 def _trials(options: argparse.Namespace, plan: TeamPlan) -> list[TeamTrial]:

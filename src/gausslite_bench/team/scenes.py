@@ -71,10 +71,14 @@ class HomeTeamPlan:
 
 @dataclass(frozen=True, slots=True)
 class RecordingTeamPlan:
-    """A team in one recording: agent i has the i-th of equal parts in time, and the i-th kind of object, in turn."""
+    """A recorded team: agent i has the i-th recording, and the i-th kind of object, in turn.
+
+    recordings: of each agent, in one world frame; empty if the agents have equal parts in time of one recording.
+    """
 
     kinds: tuple[RealScenePlan, ...]
     agents: int = 2
+    recordings: tuple[RealScenePlan, ...] = ()
 
     def __post_init__(self) -> None:
         _require_agents(self.agents)
@@ -93,14 +97,16 @@ class RecordingTeamPlan:
         """Return the scenes at (width_px, height_px). Raises DatasetError, InvalidInputError."""
         chosen = [self.kinds[i % len(self.kinds)] for i in range(self.agents)]
         names = tuple(dict.fromkeys(name for plan in chosen for name in plan.objects))
-        scene = replace(self.kinds[0], objects=names).load(size)
-        count = len(scene.training)
-        agents = {}
-        for i, plan in enumerate(chosen):
-            part = scene.training[i * count // self.agents : (i + 1) * count // self.agents]
-            regions = choose_regions(scene.info.regions, plan.objects)
-            agents[f"agent-{i}"] = make_scene(plan.task, part, scene.held_out, regions, scene.info)
-        return agents
+        scenes = [replace(plan, objects=names).load(size) for plan in self.recordings or self.kinds[:1]]
+        info, held_out = scenes[0].info, [view for scene in scenes for view in scene.held_out]
+        parts = [scene.training for scene in scenes]
+        if not self.recordings:
+            count = len(parts[0])
+            parts = [parts[0][i * count // self.agents : (i + 1) * count // self.agents] for i in range(self.agents)]
+        return {
+            f"agent-{i}": make_scene(plan.task, part, held_out, choose_regions(info.regions, plan.objects), info)
+            for i, (plan, part) in enumerate(zip(chosen, parts, strict=True))
+        }
 
 
 TeamPlan = HomeTeamPlan | RecordingTeamPlan
