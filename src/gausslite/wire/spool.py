@@ -1,9 +1,9 @@
 """Store the latest update of every voxel and the selected keyframes for the uplink, and whether they are pending.
 
 An update is pending until the server has accepted it or permanently rejected it. A pending update is due if its voxel
-was never sent, has lost all Gaussians or a quarter of its Σkappa, or if its Σkappa has changed enough since then: the
-more often it was sent, the more, because training changes it less and less. A newer update replaces the older one of
-its voxel, so the map bounds the spool. With a path, it is a SQLite file that survives a restart; otherwise in memory.
+was never sent, has lost all Gaussians or a quarter of its Σkappa, or if its Σkappa has grown enough since then, in
+proportion to the sent one: training changes a voxel less and less. A newer update replaces the older one of its voxel,
+so the map bounds the spool. With a path, it is a SQLite file that survives a restart; otherwise in memory.
 
 Updates and keyframes share one bandwidth: the highest value per byte is sent first. The value of an update is the
 change of Σkappa, the number of optimiser updates that the server lacks. The value of a keyframe has the same unit.
@@ -50,7 +50,7 @@ _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
     key INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
     count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL,
-    sends INTEGER NOT NULL DEFAULT 0, acknowledged_seq INTEGER, checksum INTEGER);
+    acknowledged_seq INTEGER, checksum INTEGER);
 CREATE TABLE IF NOT EXISTS keyframes (
     frame_index INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, value REAL NOT NULL, coverage BLOB NOT NULL,
     data BLOB NOT NULL, pending INTEGER NOT NULL, checksum INTEGER);
@@ -58,8 +58,8 @@ CREATE TABLE IF NOT EXISTS properties (name TEXT PRIMARY KEY, value) WITHOUT ROW
 """
 _ENQUEUE = """
 INSERT INTO voxel_updates
-    (key, enqueue_count, purpose, kappa_sum, count, gaussians, pending, sent_kappa, sends, checksum)
-VALUES (?, 1, ?, ?, ?, ?, 1, -1, 0, ?)
+    (key, enqueue_count, purpose, kappa_sum, count, gaussians, pending, sent_kappa, checksum)
+VALUES (?, 1, ?, ?, ?, ?, 1, -1, ?)
 ON CONFLICT (key) DO UPDATE SET enqueue_count = enqueue_count + 1, purpose = excluded.purpose,
     kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1,
     checksum = excluded.checksum
@@ -81,11 +81,11 @@ _DAMAGED = (
 _SELECT_SLICE = f"""
 SELECT place, key, {_WIRE_BYTES_PER_VOXEL} + {_WIRE_BYTES_PER_GAUSSIAN} * count,
     sent_kappa < 0 OR count = 0 OR kappa_sum <= 0.75 * sent_kappa
-        OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1) * (1 << min(max(sends, 1) - 1, 2))
+        OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1)
 FROM voxel_updates WHERE pending = 1 AND purpose = ? AND place %s ORDER BY place, key LIMIT {_SLICE}
 """  # noqa: S608 - constants of this file
 _SELECT_EQUAL, _SELECT_NEXT = (_SELECT_SLICE % condition for condition in ("= ? AND key > ?", "> ?"))
-_RESEND = "UPDATE voxel_updates SET pending = 1, sent_kappa = -1, sends = 0, acknowledged_seq = NULL WHERE key = ?"
+_RESEND = "UPDATE voxel_updates SET pending = 1, sent_kappa = -1, acknowledged_seq = NULL WHERE key = ?"
 _SELECT_PENDING = """
 SELECT key, enqueue_count, kappa_sum, count, gaussians FROM voxel_updates WHERE key = ? AND pending = 1
 """
@@ -240,8 +240,8 @@ class Spool:
     def next_round(self, max_bytes: int, resend_threshold: float) -> SpoolRound | None:
         """Return what is due with the highest value per byte, about max_bytes, at least one; None if nothing is due.
 
-        A voxel sent once is due if its Σkappa has changed by the share resend_threshold of the sent value; twice: by
-        double the share; more often: by four times the share. Voxels of the handover follow when nothing else is due.
+        A voxel that was sent is due if its Σkappa has changed by resend_threshold times the sent value, or has lost a
+        quarter. Voxels of the handover follow when nothing else is due.
         """
         keyframes = [_Due(*row) for row in self._select(_DUE_KEYFRAMES)]
         # both are sorted by value per byte
@@ -328,10 +328,7 @@ class Spool:
         """Mark these updates as not pending, because the server has accepted or permanently rejected them."""
         batch = sent.batch
         triples = zip(sent.enqueue_counts.tolist(), batch.kappa_sums.tolist(), batch.keys.tolist(), strict=True)
-        update = (
-            "UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ?, sends = sends + 1 WHERE key = ?"
-        )
-        self._update(update, triples)
+        self._update("UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ? WHERE key = ?", triples)
 
     @property
     def pending_voxels(self) -> int:

@@ -39,7 +39,7 @@ def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
 class UplinkSettings:
     """Limits and intervals of sending.
 
-    resend_threshold: change of a voxel's Σkappa, as a share of the sent value, from which it is sent a second time, see
+    resend_threshold: change of a voxel's Σkappa, in units of the sent value, from which it is sent again, see
     `Spool.next_round`; 0 while the uplink drains.
     """
 
@@ -47,7 +47,7 @@ class UplinkSettings:
         None, "bandwidth limit in kilobits per second (default: none)", key="uplink-kbps", unit="kbit/s", low=0.001
     )
     interval_s: float = 1.0  # minimum time between rounds, so that several changes of a voxel are sent as one
-    resend_threshold: float = 0.5
+    resend_threshold: float = 3.0  # bytes of the whole maps: 2 sends 5 % more, 4 sends 4 % fewer, see results of teams
     round_bytes: int = 4 << 20  # size limit of a round
     deadline_s: float = 30.0  # of each call
     first_backoff_s: float = 0.2  # wait before the first retry

@@ -144,22 +144,22 @@ def test_small_changes_are_sent_only_when_draining() -> None:
 def _send_due(spool: Spool, kappa: int) -> bool:
     """Enqueue a voxel with this Σkappa; return whether it was due, and mark it as sent then."""
     spool.enqueue(make_batch({1: [kappa]}), Purpose.ROI)
-    if (due := spool.next_round(1 << 20, 0.5)) is None or due.voxels is None:
+    if (due := spool.next_round(1 << 20, UplinkSettings().resend_threshold)) is None or due.voxels is None:
         return False
     spool.mark_done(due.voxels)
     return True
 
 
-def test_a_voxel_is_sent_again_after_growing_by_half_then_to_twice_then_to_thrice_its_sent_kappa() -> None:
+def test_a_voxel_is_sent_again_after_growing_to_four_times_its_sent_kappa() -> None:
     spool = Spool(None, "robot", GRID)
-    sent = [kappa for kappa in range(10, 280) if _send_due(spool, kappa)]
-    assert sent == [10, 15, 30, 90, 270]
+    sent = [kappa for kappa in range(10, 700) if _send_due(spool, kappa)]
+    assert sent == [10, 40, 160, 640]
     spool.close()
 
 
 def test_a_voxel_that_lost_a_quarter_of_its_kappa_is_sent_at_once() -> None:
     spool = Spool(None, "robot", GRID)
-    assert [_send_due(spool, kappa) for kappa in (100, 200, 151, 150)] == [True, True, False, True]
+    assert [_send_due(spool, kappa) for kappa in (100, 400, 301, 300)] == [True, True, False, True]
     spool.close()
 
 
@@ -179,12 +179,12 @@ def test_a_spool_of_the_two_versions_before_goes_on(tmp_path: Path, earlier: str
     spool.close()
     with closing(sqlite3.connect(path)) as database:
         database.executescript(earlier)
-    for kappa in (14, 15):
+    for kappa in (39, 40):
         spool = Spool(path, "robot", GRID)
         found = spool.acknowledged_digests()
         assert (found.tiles.tolist(), found.hashes.tolist()) == (expected.tiles.tolist(), expected.hashes.tolist())
         assert spool.keyframes() == keyframes
-        assert _send_due(spool, kappa) == (kappa == 15)
+        assert _send_due(spool, kappa) == (kappa == 40)
         spool.close()
     with closing(sqlite3.connect(path)) as database:
         database.executescript(f"{_NO_ORDER}; ALTER TABLE voxel_updates DROP COLUMN acknowledged_seq")
