@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.corrected import CorrectedSource
-from gausslite_calibration.depth_consistency import DepthPair, find_other_depth
+from gausslite_calibration.depth_consistency import DepthPair, best_factor, find_other_depth
 from gausslite_calibration.rig_fit import REGISTERED, UNREGISTERED, PointMotion, fit_intrinsics, fit_mount
 from gausslite_poses.features import RelativePose, detect_features, relative_pose
 
@@ -37,8 +37,8 @@ _DOUBTFUL, _WRONG, _RIGHT = 0.15, 0.6, 0.3
 """Median error of the points' places, as a share of their motion. Right poses of real recordings have 0.02 to 0.13,
 also with unregistered depth; poses of another convention 0.16 to 1.8, and the right reading at most a third of it."""
 _CONVENTION_GAIN, _SCALE_GAIN = 0.4, 0.7
-_LEAST_FACTOR = 1.5
-"""Depth counts as wrong beyond this factor; right recordings reach 1.2."""
+_LEAST_FACTOR, _ROUND = 1.5, 0.04
+"""Depth counts as wrong beyond the first, a factor; right recordings reach 1.2. The second rounds it to one digit."""
 _JUMP = 0.03
 """A share of the image's width. Points of consecutive frames of real recordings are off by 0.005, of every fourth frame
 with unregistered depth by 0.023; a jump by 15 cm at a distance of 2 m by 0.032."""
@@ -172,7 +172,8 @@ def _find_everywhere(source: Source, trajectory: Trajectory, pairs: Sequence[_Pa
     """Return the contradiction of most pairs; None without one."""
     stated = _Reading("", _motions(trajectory.T_world_camera, pairs))
     error = float(_errors([stated], pairs)[0])
-    depth, best = _scaled_to_agree(stated, pairs, error), None
+    depth = _scaled_to_agree(stated, pairs, error, lambda factor: best_factor(source, trajectory, factor))
+    best = None
     if not math.isfinite(error):
         return None
     if error >= _DOUBTFUL or depth is not None:
@@ -298,8 +299,10 @@ def _best_reading(
     return next((found.words for found in scaled if found is not None), None)
 
 
-def _scaled_to_agree(reading: _Reading, pairs: Sequence[_Pair], error: float) -> _Scaled | None:
-    """Return the reading with another unit of depth, if that lowers the error clearly."""
+def _scaled_to_agree(
+    reading: _Reading, pairs: Sequence[_Pair], error: float, refine: Callable[[float], float] = float
+) -> _Scaled | None:
+    """Return the reading with another unit of depth, if that lowers the error clearly; refine: makes it more exact."""
     scale = reading.scale(pairs)
     if scale is None or abs(math.log(scale)) < math.log(_LEAST_FACTOR):
         return None
@@ -307,9 +310,11 @@ def _scaled_to_agree(reading: _Reading, pairs: Sequence[_Pair], error: float) ->
     # small errors have other causes, such as the offset of a depth camera
     if scaled_error > min(_RIGHT, (_SCALE_GAIN if error >= _DOUBTFUL else _CONVENTION_GAIN) * error):
         return None
+    scale = 1.0 / refine(1.0 / scale)
     factor, change = (1.0 / scale, "multiplied") if scale < 1.0 else (scale, "divided")
-    rounded = float(f"{factor:.2g}")
-    depth = f"depth {change} by {rounded:g} (the unit of depth, or that of the positions, is another one)"
+    round_one = float(f"{factor:.1g}")
+    number = round_one if abs(factor / round_one - 1.0) < _ROUND else float(f"{factor:.2g}")
+    depth = f"depth {change} by {number:g} (the unit of depth, or that of the positions, is another one)"
     return _Scaled(f"{reading.words}, and {depth}," if reading.words else depth, scaled_error)
 
 

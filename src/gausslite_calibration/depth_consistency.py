@@ -35,6 +35,8 @@ _AGREES, _FAR_BETTER = 0.6, 0.75
 """Where few frames have features in common, a reading of the poses needs this mean disagreement of neighbours, and this
 share of the next best one's: right ones of five frames, far apart, have 0.45 and at most 0.69."""
 _UNITS = (5.0, 10.0, 1000.0)
+_NEAR = np.geomspace(0.5, 2.0, 57)
+"""Factors beside the one of features, which errs by 1.5 where depth and colour are not registered."""
 _MAX_LAG, _MAX_LAG_S = 15, 3.0
 
 
@@ -78,7 +80,7 @@ def find_other_depth(
         nearest = np.array([pair.disagreement(pair.motion(T))[0] for pair in tried])
         judged = nearest[np.isfinite(nearest)]
         is_random = len(judged) >= _MIN_PAIRS and float(np.median(judged)) > _RANDOM_ERROR
-        return _agreeing(tried, T, other_poses) if is_random else None
+        return _agreeing(tried, trajectory, other_poses) if is_random else None
     stated = np.array([pair.disagreement(pair.motion(T))[0] for pair in pairs])
     if float(stated.mean()) < _LEAST_ERROR:
         return None
@@ -97,13 +99,27 @@ def find_other_depth(
     return None if found[best] > _GAIN or (best.lag and poses_are_late(best.lag)) else best
 
 
-def _agreeing(pairs: Sequence[DepthPair], T: Float64[ndarray, "n 4 4"], other_poses: OtherPoses) -> DepthReading:
+def best_factor(source: Source, trajectory: Trajectory, factor: float) -> float:
+    """Return the factor of depth near this one by which depth images agree best; this one if few can be judged."""
+    found = _with_ways(trajectory, 1.0 / factor)
+    pairs, factors = list(_farthest_pairs(source, found)), factor * _NEAR
+    ways = (_with_ways(trajectory, 1.0 / near).T_world_camera for near in factors)
+    errors = [_mean_error(pairs, [pair.motion(T) for pair in pairs]) for T in ways]
+    return float(factors[np.argmin(errors)]) if np.isfinite(errors).any() else factor
+
+
+def _with_ways(trajectory: Trajectory, factor: float) -> Trajectory:
+    """Return the trajectory with its positions multiplied: shorter ways are as good as depth multiplied."""
+    T_world_camera = trajectory.T_world_camera.copy()
+    T_world_camera[:, :3, 3] *= factor
+    return replace(trajectory, T_world_camera=T_world_camera)
+
+
+def _agreeing(pairs: Sequence[DepthPair], trajectory: Trajectory, other_poses: OtherPoses) -> DepthReading:
     """Return the reading of the poses, or unit of depth, by which neighbours agree far better than by any other."""
     errors = {DepthReading(words): _mean_error(pairs, motions) for words, motions in other_poses(pairs)}
     for factor in (*_UNITS, *(1.0 / unit for unit in _UNITS)):
-        # shorter ways of the camera are as good as depth multiplied
-        scaled = T.copy()
-        scaled[:, :3, 3] /= factor
+        scaled = _with_ways(trajectory, 1.0 / factor).T_world_camera
         change, number = ("multiplied", factor) if factor > 1.0 else ("divided", 1.0 / factor)
         reading = DepthReading(f"depth {change} by {number:g} (the unit of depth is another one)", only_unit=True)
         errors[reading] = _mean_error(pairs, [pair.motion(scaled) for pair in pairs])

@@ -26,7 +26,7 @@ def configure(parser: CommandParser) -> None:
     )
     kinds = [*map(str, EditKind), _AREA, _NO_AREA, _LIST]
     add("kind", choices=kinds, help="what to do; area: name a polygon on the floor; list: print edits and areas")
-    object_help = "the object's id, as `gausslite objects` prints it; the number of the edit to undo; the area's name"
+    object_help = "the object's id, or its noun if no other has it; the number of the edit to undo; the area's name"
     add("object", nargs="?", default="", help=object_help)
     values_help = (
         "the new noun, the note, the id of the object that is merged into this one, where to split (x=1.25; "

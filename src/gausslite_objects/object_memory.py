@@ -123,16 +123,18 @@ def new_edit(
         return Edit(kind, author, now_ns, value=number)
     if kind in _NEEDS_VALUE and not value:
         raise InvalidInputError(f"{kind} {quote_name(object_id)}: expected a value, got none")
-    target = _with_id(objects, object_id)
-    other = _with_id(objects, value) if kind is EditKind.MERGE else None
+    target = _named(objects, object_id)
+    other = _named(objects, value) if kind is EditKind.MERGE else None
     if other is not None:
         require_near(target, other)
     return Edit(kind, author, now_ns, target, value, other)
 
 
-def _with_id(objects: Sequence[ObjectLandmark], object_id: str) -> ObjectLandmark:
-    for landmark in objects:
-        if landmark.object_id == object_id:
-            return landmark
-    known = ", ".join(landmark.object_id for landmark in objects[:20]) or "none"
-    raise InvalidInputError(f"object: expected one of {known}, got {quote_name(object_id)}")
+def _named(objects: Sequence[ObjectLandmark], name: str) -> ObjectLandmark:
+    """Return the object of an id, or the only one of a noun. Raises InvalidInputError."""
+    of_noun = [landmark for landmark in objects if landmark.noun == name]
+    found = [landmark for landmark in objects if landmark.object_id == name] or of_noun
+    if len(found) == 1:
+        return found[0]
+    known = ", ".join(landmark.object_id for landmark in (of_noun or objects)[:20]) or "none"
+    raise InvalidInputError(f"object: expected one of {known}, got {quote_name(name)}")

@@ -30,7 +30,7 @@ _UP_POSES = 64
 
 
 class SevenScenesSource(NumberedFolderSource):
-    """A folder of frame-%06d.color.{png,jpg}, .depth.png (mm; 0 and 65535 invalid) and .pose.txt (camera to world).
+    """A folder of frame-%06d.color.{png,jpg}, .depth.{png,pgm} (mm; 0, 65535 invalid) and .pose.txt (camera to world).
 
     The camera comes from a camera file, see `read_folder_camera`; otherwise 640x480 images get the intrinsics that the
     7-Scenes authors publish. Frames whose pose has no finite
@@ -62,7 +62,8 @@ class SevenScenesSource(NumberedFolderSource):
         return self._up_axis
 
     def _depth_path(self, number: int) -> Path:
-        return self._folder / f"frame-{number:06d}.depth.png"
+        path = self._folder / f"frame-{number:06d}.depth.png"
+        return path if path.is_file() or not path.with_suffix(".pgm").is_file() else path.with_suffix(".pgm")
 
     def _pose_location(self, number: int) -> str:
         return str(self._folder / f"frame-{number:06d}.pose.txt")

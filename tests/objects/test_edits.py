@@ -65,6 +65,13 @@ def test_a_renamed_object_has_its_new_name_for_later_edits(run: Path, capsys: py
     assert capsys.readouterr().out.splitlines()[0] == f"1: rename \"{FOUND.object_id}\" as 'cup', by ann"
 
 
+def test_an_object_is_named_by_its_noun_if_no_other_has_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _edit(write_run(tmp_path / "one"), "rename", "mug", "cup")
+    two = write_run(tmp_path / "two", objects=[MUG, {**MUG, "id": "mug-2"}])
+    assert main(["edit", str(two), "rename", "mug", "cup"]) == 2
+    assert f"object: expected one of {FOUND.object_id}, mug-2, got 'mug'" in capsys.readouterr().err
+
+
 def test_a_pinned_object_stays_and_merged_ones_are_one(run: Path) -> None:
     _edit(run, "pin", FOUND.object_id)
     edited = _edited(run)

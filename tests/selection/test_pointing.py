@@ -1,5 +1,7 @@
 """Regions that a person points at: their overlap with ground truth, and what is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -88,12 +90,38 @@ def test_a_point_outside_the_image_or_without_depth_is_refused(prompt, depth_m, 
     assert str(error.value) == message
 
 
-def test_a_click_whose_region_has_much_of_the_image_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    mask_on_image(wall(0.5), points_px=[(40, 30)])
-    assert capsys.readouterr().err == ("point 40,30: its region has 100% of frame 7; if that is too much, draw a box\n")
+def test_a_click_whose_region_has_much_of_the_image_is_refused() -> None:
+    refused = "expected one object, its region would have 100% of frame 7; "
+    with pytest.raises(InvalidInputError, match=f"^point 40,30: {refused}draw a box$"):
+        mask_on_image(wall(0.5), points_px=[(40, 30)])
+    with pytest.raises(InvalidInputError, match=f"^target 0,0,0.5: {refused}state a radius .0,0,0.5,RADIUS. or"):
+        region_at((0.0, 0.0, 0.5), [wall(0.5)])
     mask_on_image(wall(4.0), points_px=[(40, 30)])
-    mask_on_image(wall(0.5), boxes_px=[(0, 0, 80, 60)])
-    assert capsys.readouterr().err == ""
+    assert mask_on_image(wall(0.5), boxes_px=[(0, 0, 80, 60)]).any()
+
+
+def test_a_click_stops_where_the_clicked_plane_ends() -> None:
+    """A wall with a poster stands on a floor: pixels next to each other have almost the same depth."""
+    frame = wall(4.0)
+    rows, columns = np.indices(frame.depth_m.shape)
+    floor = rows >= 45
+    depth_m = np.where(floor, 4.0 * 15 / (rows - 29.9), 4.0).astype(np.float32)
+    poster = (rows >= 20) & (rows < 30) & (columns >= 30) & (columns < 44)
+    rgb = np.where(poster[..., None], 220, frame.rgb).astype(np.uint8)
+    frame = dataclasses.replace(frame, depth_m=depth_m, rgb=rgb)
+    on_wall = mask_on_image(frame, points_px=[(14, 25)])
+    assert np.count_nonzero(on_wall) > 200
+    assert np.count_nonzero(on_wall & floor) < 0.1 * np.count_nonzero(on_wall)
+    on_poster = mask_on_image(frame, points_px=[(36, 25)])
+    assert np.count_nonzero(on_poster ^ poster) < 0.4 * np.count_nonzero(poster)
+
+
+def test_a_click_on_a_flat_thing_does_not_take_the_table(home) -> None:
+    frames, _ = home
+    newspaper = open_source("sim:home?size=160x120").regions()["newspaper"]
+    frame, (row, column) = best_view(frames, newspaper)
+    mask, exact = mask_on_image(frame, [(column + 0.5, row + 0.5)]), newspaper.mask(frame)
+    assert np.count_nonzero(mask & exact) > 0.6 * np.count_nonzero(mask | exact)
 
 
 def test_a_point_that_no_frame_shows_is_refused() -> None:

@@ -17,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, RateLimitError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -50,6 +50,7 @@ _Result = TypeVar("_Result")
 _Arguments = ParamSpec("_Arguments")
 _log = logging.getLogger(__name__)
 _IDLE_WAIT_S = 10.0
+_SHUTTING_DOWN = "agent: shutting down; it accepts no more work"
 LOCALISING = "the agent localises itself in the map of --prior"
 
 
@@ -74,6 +75,28 @@ def _on_worker(
     @functools.wraps(method)
     def queue(self: MappingWorker, /, *arguments: _Arguments.args, **more: _Arguments.kwargs) -> Future[_Result]:
         return self._submit(lambda: method(self, *arguments, **more))
+
+    return queue
+
+
+def _before_frames(
+    method: Callable[Concatenate[MappingWorker, _Arguments], _Result],
+) -> Callable[Concatenate[MappingWorker, _Arguments], Future[_Result]]:
+    """Let the method run on the worker thread before the frames that wait, because a person waits for it."""
+
+    @functools.wraps(method)
+    def queue(self: MappingWorker, /, *arguments: _Arguments.args, **more: _Arguments.kwargs) -> Future[_Result]:
+        answer: Future[_Result] = Future()
+
+        def call() -> None:
+            try:
+                answer.set_result(method(self, *arguments, **more))
+            except Exception as error:
+                answer.set_exception(error)
+
+        self._calls.append((call, answer))
+        self._submit(self._answer_calls)
+        return answer
 
     return queue
 
@@ -116,6 +139,8 @@ class MappingWorker:
         # guarded by the lock: frames arrive on several threads
         self._queue: deque[QueuedFrame] = deque()
         self._queue_lock = threading.Lock()
+        # of people, in their order; each runs before the next frame
+        self._calls: deque[tuple[Callable[[], None], Future[Any]]] = deque()
         self._worker = ThreadPoolExecutor(1, "mapper")
         # idle iterations that are left since the latest frame, whether one is queued, and whether some are unpublished
         self._idle_left, self._idle_scheduled, self._idle_unpublished = 0, False, False
@@ -128,7 +153,7 @@ class MappingWorker:
         """Return the map's revision. It increases, also across restarts."""
         return self.status().map_revision
 
-    @_on_worker
+    @_before_frames
     def assign(
         self, graph: TaskGraph | None, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()
     ) -> TaskGraph:
@@ -146,7 +171,7 @@ class MappingWorker:
         self._report_task(task_mapper)
         return extended
 
-    @_on_worker
+    @_before_frames
     def change_objects(self, change: Callable[[], bool]) -> None:
         """Run a person's change of the objects; if it returns True, the task means others, and its region follows."""
         if change() and self._task_mapper is not None:
@@ -192,7 +217,7 @@ class MappingWorker:
         for record in self.records:
             record.write(folder, keyframes)
 
-    @_on_worker
+    @_before_frames
     def camera_view(self) -> CameraView | None:
         """Return what the camera sees, for a person; None before the first keyframe."""
         return None if self._task_mapper is None else self._task_mapper.camera_view()
@@ -271,12 +296,18 @@ class MappingWorker:
         self._worker.shutdown(wait=True, cancel_futures=True)
         while (queued := self._take()) is not None:
             self._report_dropped(queued, "the agent is shutting down")
+        while self._calls:
+            self._calls.popleft()[1].set_exception(UnavailableError(_SHUTTING_DOWN))
 
     def _submit(self, work: Callable[[], _Result]) -> Future[_Result]:
         try:
             return self._worker.submit(work)
         except RuntimeError as error:
-            raise UnavailableError("agent: shutting down; it accepts no more work") from error
+            raise UnavailableError(_SHUTTING_DOWN) from error
+
+    def _answer_calls(self) -> None:
+        while self._calls:
+            self._calls.popleft()[0]()
 
     def _take(self) -> QueuedFrame | None:
         with self._queue_lock:
@@ -315,6 +346,7 @@ class MappingWorker:
         return self._sent_voxels.add_tombstones(batch, self.uplink.spool.voxels(purpose))
 
     def _map_next(self) -> None:
+        self._answer_calls()
         queued = self._take()
         if queued is None:
             return

@@ -27,7 +27,7 @@ from gausslite.mission.runner import FrameStream, ground_truth_notes
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.pages import load_pages
 from gausslite.plugins import Group, installed, load
-from gausslite.process import ROBOT_LOST
+from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.run_service import run_service
 from gausslite.wire.server import serve_until_stopped
@@ -123,8 +123,8 @@ class PeriodicSave:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the agent and return its exit code.
 
-    1 if data that no spool keeps was not sent, 4 if the robot was lost at the end, 2 with one line on stderr for an
-    error the operator can fix, else 0.
+    1 if data that no spool keeps was not sent, 4 if the robot was lost at the end, 3 if nothing of the task was found,
+    2 with one line on stderr for an error the operator can fix, else 0.
     """
 
     async def serve() -> int:
@@ -183,7 +183,9 @@ async def _serve(settings: AgentSettings) -> int:
         if lost:
             _log.error("%s", lost)
             return 1
-        return ROBOT_LOST if worker.status().localisation is LocalisationState.LOST else 0
+        if worker.status().localisation is LocalisationState.LOST:
+            return ROBOT_LOST
+        return 0 if worker.status().has_found_task else TASK_NOT_FOUND
 
 
 def _require_usable(settings: AgentSettings) -> None:

@@ -16,7 +16,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, MapFileEr
 from gausslite.domain.objects import NounReport, ObjectLandmark
 from gausslite.domain.pose import PoseCorrection
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_text, int_array
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.checkpoint import SavedRun
 from gausslite.mission.localisation_monitor import LocalisationState
@@ -239,8 +239,15 @@ class WorkerStatus:
     def task_notes(self) -> tuple[str, ...]:
         """What of the task is not understood, and one line for each target if no frame has shown the task's region."""
         unread = () if self.graph is None else (line for line in self.graph.warnings if line not in self.notes)
-        targets = () if self.graph is None or self.mapped == 0 or self.roi_share_sum > 0 else self.graph.targets
+        targets = () if self.graph is None or self.has_found_task else self.graph.targets
         return (*unread, *(f"target {target!r} was not found in {self.mapped} frames" for target in targets))
+
+    @property
+    def has_found_task(self) -> bool:
+        """False if frames were mapped with a task, and no frame and no object shows a target of it."""
+        targets = set() if self.graph is None else {noun_of(target) for target in self.graph.targets}
+        is_known = any(landmark.noun in targets for landmark in self.objects)
+        return not targets or self.mapped == 0 or self.roi_share_sum > 0 or is_known
 
     @property
     def load_notes(self) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ from gausslite.domain.file_formats import FOREIGN_BYTES, foreign_format
 from gausslite.domain.frame import Frame, image_size
 
 _MAX_IMAGE_PX = 1 << 26
+_CUT_SHORT = "expected a whole image file, got one cut short"
+_PGM_HEADER = re.compile(rb"P5(?:\s+#[^\n]*)*\s+(\d{1,6})\s+(\d{1,6})\s+(\d{3,5})\s")
 _PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\x01\xd0-\xd7])", re.DOTALL)
 """The start of a JPEG segment; other bytes after FF belong to compressed pixels."""
@@ -105,7 +107,7 @@ def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
         depth_m = (_read_npy(path) / np.float32(units.per_metre)).astype(np.float32, copy=False)
         depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
         return depth_m
-    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    raw = _read_pgm(path) if path.suffix == ".pgm" else _decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
     return depth_in_metres(raw, units.per_metre)
@@ -167,14 +169,31 @@ def _read_npy(path: Path) -> Float32[ndarray, "h w"]:
     return np.array(mapped)
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
+def _read_pgm(path: Path) -> UInt16[ndarray, "h w"]:
+    """Return a 16-bit PGM image, as SensReader writes depth. Raises DatasetError."""
+    data = _read_image(path)
+    header = _PGM_HEADER.match(data)
+    if header is None or int(header[3]) <= np.iinfo(np.uint8).max:
+        raise DatasetError(f"{path}: expected a binary 16-bit PGM image, got a file which begins with {data[:16]!r}")
+    width_px, height_px = int(header[1]), int(header[2])
+    require_pixel_count(str(path), width_px, height_px)
+    if len(data) < header.end() + 2 * width_px * height_px:
+        raise DatasetError(f"{path}: {_CUT_SHORT}")
+    raw = np.frombuffer(data, ">u2", width_px * height_px, header.end())
+    return raw.reshape(height_px, width_px).astype(np.uint16)
+
+
+def _read_image(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise DatasetError(f"{path}: expected an image, got none") from None
     except OSError as error:
         raise DatasetError(f"{path}: expected a readable image, got {type(error).__name__}") from None
-    return decode_image(str(path), data, flags)
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    return decode_image(str(path), _read_image(path), flags)
 
 
 def decode_image(location: str, data: bytes, flags: int) -> NDArray[Any]:
@@ -192,7 +211,7 @@ def decode_image(location: str, data: bytes, flags: int) -> NDArray[Any]:
     # decoders fill a truncated file with grey without an error, so look for the end first
     is_whole = _is_whole_png(location, data) if data.startswith(_PNG_MAGIC) else _is_whole_jpeg(data)
     if size_px is None or not is_whole:
-        raise DatasetError(f"{location}: expected a whole image file, got one cut short")
+        raise DatasetError(f"{location}: {_CUT_SHORT}")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DatasetError(f"{location}: expected an image, got bytes that cannot be decoded")

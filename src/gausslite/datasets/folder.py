@@ -55,13 +55,16 @@ def estimate_up(
 def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) -> str:
     """Return the message on images that show another up, which hardly turned ones do by their upper side, else ""."""
     images, shown = "images", np.array(estimate_up(rotations_world_camera, up_axis))
-    if shown @ up_axis > _LEVEL_COSINE:
-        _, down, ahead = rotations_world_camera.sum(axis=0).T / max(len(rotations_world_camera), 1)
-        level = _LEVEL_COSINE
+    right, down, ahead = rotations_world_camera.sum(axis=0).T / max(len(rotations_world_camera), 1)
+    level = _LEVEL_COSINE
+    if shown @ up_axis > level:
         if np.linalg.norm(down) < level or down @ up_axis < -level / 2 or ahead @ up_axis < -level:
             return ""
         images, shown = "upright images", -down / np.linalg.norm(down)
     stated, found = (",".join(f"{value + 0.0:.2g}" for value in np.round(axis, 2)) for axis in (up_axis, shown))
+    if abs(right @ up_axis) > level:
+        # a camera in portrait has the poses of a level one in a world that lies on its side
+        return f"{images} show up as {found}, those held on their side as {stated}: state up={found} or up={stated}"
     return f"{images} show up as {found}, not as {stated}; 'on', heights and grids need it: state up={found}"
 
 

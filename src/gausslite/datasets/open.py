@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,8 @@ from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, installed, load, names
 
+_MAX_LISTED, _MAX_NAMED = 1000, 5
+"""Entries of a folder among which sequences are looked for, and of them those that a message names."""
 _TUM: Final[SourceReader] = FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)")
 
 
@@ -82,15 +85,9 @@ def _reader_of(spec: str) -> SourceReader | None:
     return next((reader for reader in _readers() if reader.recognises(spec)), None)
 
 
-def sequences_inside(folder: Path) -> list[tuple[SourceReader, Path]]:
-    """Return the folders in a folder that hold a sequence, by name, and their readers."""
-    folders = [path for path in sorted(folder.iterdir()) if path.is_dir()]
-    return [(reader, path) for path in folders if (reader := _reader_of(str(path))) is not None]
-
-
 def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
     """Return the only sequence in a folder, and its reader. Raises DatasetError for none and for several."""
-    inside = sequences_inside(folder)
+    inside = sequences_among(folder.iterdir())
     if len(inside) == 1:
         [(reader, path)] = inside
         return reader, str(path)
@@ -99,8 +96,17 @@ def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
         raise DatasetError(f"{folder}: holds {len(inside)} sequences; expected one of them: {found}")
     if not any(folder.iterdir()):
         raise DatasetError(f"{folder}: expected a sequence, got an empty folder")
+    deeper = [str(path) for pattern in ("*/*", "*/*/*") for _, path in sequences_among(folder.glob(pattern))[:_MAX_NAMED]]
+    if deeper:
+        raise DatasetError(f"{folder}: holds sequences deeper inside; expected {_alternatives(deeper)}")
     layouts = _alternatives([reader.layout for reader in _readers()])
     raise DatasetError(f"{folder}: unknown layout; expected {layouts}{_absent_readers()}")
+
+
+def sequences_among(paths: Iterable[Path]) -> list[tuple[SourceReader, Path]]:
+    """Return which of the first paths are sequences, folders or files, each with its reader."""
+    some = sorted(itertools.islice(paths, _MAX_LISTED))
+    return [(reader, path) for path in some if (reader := _reader_of(str(path))) is not None]
 
 
 def _unknown_address(spec: str, path: Path) -> DatasetError:

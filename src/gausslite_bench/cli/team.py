@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.config.option import build, option
-from gausslite.datasets.open import sequences_inside
+from gausslite.datasets.open import sequences_among
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import prepare_folder
@@ -89,7 +89,7 @@ def _plans(options: argparse.Namespace) -> tuple[list[TeamPlan], tuple[int, int]
 
 def _robots_plans(options: argparse.Namespace, frames: int | None) -> list[tuple[list[RealScenePlan], tuple[int, int]]]:
     """Return the plans and the image size of each robot, if the folder holds several recordings; empty otherwise."""
-    inside = sequences_inside(options.real) if options.real is not None and options.real.is_dir() else []
+    inside = sequences_among(options.real.iterdir()) if options.real is not None and options.real.is_dir() else []
     if len(inside) < 2:
         return []
     regions = options.roi or options.real / REGIONS_FILE

@@ -173,6 +173,7 @@ def test_damage_is_named(
         ("place", lambda path: path.write_text(""), "got an empty file"),
         ("place", lambda path: path.mkdir(), "got an empty folder"),
         ("place", lambda path: (path / "other").mkdir(parents=True), "unknown layout; expected TUM"),
+        ("place", lambda path: write_seven_scenes(path / "day" / "desk"), "deeper inside; expected .*place/day/desk$"),
         ("desk.tar.gz", lambda path: path.write_bytes(gzip.compress(b"")), "got a gzip archive; unpack it first"),
     ],
 )

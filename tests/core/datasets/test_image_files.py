@@ -1,12 +1,15 @@
 """Images as devices write them: turned by EXIF, with bytes after their end, or cut; the stored pixels are used."""
 
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from tiny_sequences import write_seven_scenes
 
-from gausslite.datasets.files import decode_image
+from gausslite.datasets.files import DepthUnits, decode_image, read_depth
+from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError
 
 PIXELS = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (40, 64, 3), dtype=np.uint8), (0, 0), 3)
@@ -67,3 +70,39 @@ def test_a_cut_image_is_refused_with_padding_or_without(name: str, share: float,
     data = FORMATS[name]
     with pytest.raises(DatasetError, match=r"image: expected (a whole|an undamaged) image"):
         decoded(data[: int(share * len(data))] + padding)
+
+
+DEPTH = np.random.default_rng(1).integers(300, 60_000, (40, 64), dtype=np.uint16)
+
+
+@pytest.mark.parametrize("comment", [b"", b"# SensReader\n"])
+def test_depth_as_pgm_is_read_as_png_is(tmp_path: Path, comment: bytes) -> None:
+    cv2.imwrite(str(tmp_path / "depth.png"), DEPTH)
+    (tmp_path / "depth.pgm").write_bytes(b"P5\n" + comment + b"64 40\n65535\n" + DEPTH.astype(">u2").tobytes())
+    as_png, as_pgm = (read_depth(tmp_path / f"depth.{kind}", DepthUnits(1000)) for kind in ("png", "pgm"))
+    assert np.array_equal(as_png, as_pgm)
+
+
+def test_frames_of_sensreader_have_depth_as_pgm(tmp_path: Path) -> None:
+    folder = write_seven_scenes(tmp_path / "seq")
+    expected = open_source(str(folder)).frame(0).depth_m
+    for path in folder.glob("*.depth.png"):
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        path.with_suffix(".pgm").write_bytes(b"P5\n%d %d\n65535\n" % raw.shape[::-1] + raw.astype(">u2").tobytes())
+        path.unlink()
+    assert np.array_equal(open_source(str(folder)).frame(0).depth_m, expected)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"P5\n64 40\n65535\n" + bytes(5119), "depth.pgm: expected a whole image file, got one cut short"),
+        (b"P5\n64 40\n255\n" + bytes(5120), "depth.pgm: expected a binary 16-bit PGM image, got"),
+        (b"P2\n64 40\n65535\n1 2 3", "depth.pgm: expected a binary 16-bit PGM image, got"),
+        (b"P5\n999999 999999\n65535\n", "depth.pgm: expected an image of 1 to"),
+    ],
+)
+def test_another_pgm_is_refused(tmp_path: Path, data: bytes, message: str) -> None:
+    (tmp_path / "depth.pgm").write_bytes(data)
+    with pytest.raises(DatasetError, match=message):
+        read_depth(tmp_path / "depth.pgm", DepthUnits(1000))

@@ -124,6 +124,11 @@ def test_images_that_show_another_upward_direction_are_reported(
     for rotation, message in (
         (np.eye(3), "upright images show up as 0,-1,0, not as 0,0,1; 'on', heights and grids need it: state up=0,-1,0"),
         (np.diag((1.0, -1.0, -1.0)), ""),
+        # held in portrait in this world, or level in one that lies on its side
+        (
+            [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]],
+            "upright images show up as -1,0,0, those held on their side as 0,0,1: state up=-1,0,0 or up=0,0,1",
+        ),
     ):
         assert up_note(np.array([rotation] * 5), (0.0, 0.0, 1.0)) == message
     open_recorded(str(folder), (0.0, -1.0, 0.0))

@@ -12,6 +12,7 @@ import pytest
 from agent_running import SETTINGS, TASK, Agent, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from uplink_running import uplink
+from waiting import wait_until
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -41,6 +42,42 @@ def test_a_full_queue_drops_and_reports_the_oldest_frame() -> None:
     assert outcomes == [Outcome.MAPPED, Outcome.DROPPED, Outcome.DROPPED, Outcome.MAPPED, Outcome.MAPPED]
     assert "queue of 2 frames" in waiting[0].result().reason
     assert "overload: 2 frames were dropped" in notes
+
+
+def test_a_task_and_a_look_at_the_camera_are_answered_before_the_frames_that_wait() -> None:
+    gates = [Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event()) for _ in range(2)]
+    tasks = iter(gates)
+    with agent(lambda _graph: next(tasks), queue_frames=4) as a:
+        a.client.assign_task(TASK)
+        reports = [a.worker.submit(frame(index)) for index in range(4)]
+        assert gates[0].reached.wait(20)
+        task = a.stub.AssignTask.future(pb.AssignTaskRequest(text="Find the chair"))
+        wait_until(lambda: len(a.worker._calls) == 1)
+        gates[0].opened.set()
+        # the second task's frame is blocked: the task was answered after one frame
+        assert task.result(20).graph.text == "Find the chair"
+        assert gates[1].reached.wait(20)
+        assert [report.done() for report in reports] == [True, False, False, False]
+        view = a.worker.camera_view()
+        gates[1].opened.set()
+        assert view.result(20) is not None
+        assert [report.result(20).outcome for report in reports] == [Outcome.MAPPED] * 4
+
+
+def test_a_task_that_waits_when_the_agent_ends_is_refused() -> None:
+    gate = Gate(ball_estimator(RuleParser().parse(TASK)), threading.Event())
+    worker = MappingWorker(SETTINGS, GRID, lambda _graph: gate)
+    worker.assign(RuleParser().parse(TASK)).result(20)
+    worker.submit(frame(0))
+    assert gate.reached.wait(20)
+    waiting = worker.assign(RuleParser().parse("Find the chair"))
+    closing = threading.Thread(target=worker.close)
+    closing.start()
+    wait_until(lambda: worker._worker._shutdown)
+    gate.opened.set()
+    closing.join(20)
+    with pytest.raises(UnavailableError, match="shutting down"):
+        waiting.result(20)
 
 
 def test_a_cancelled_report_does_not_keep_its_frame_in_the_queue() -> None:

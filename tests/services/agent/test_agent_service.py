@@ -114,7 +114,7 @@ def test_an_object_that_a_person_points_at_is_mapped_from_the_next_frame_on() ->
         (PointedObject(points_px=((99.0, 0.0),)), "expected a pixel of the image"),
         (PointedObject(points_px=((5.0, 5.0),), frame_index=7), "expected a keyframe that is kept, such as 0; got 7"),
         (PointedObject(point_m=(0.0, 0.0, 3.0)), "expected a point on a surface that a frame shows"),
-        (PointedObject(points_px=((5.0, 5.0),), noun="a\nb"), "printable"),
+        (PointedObject(boxes_px=((5.0, 5.0, 9.0, 9.0),), noun="a\nb"), "printable"),
         (PointedObject(points_px=((5.0, 5.0),) * 65), "at most 64 points and boxes"),
         (PointedObject(boxes_px=((5.0, 5.0, 9.0, 9.0),) * 40, points_px=((5.0, 5.0),) * 25), "at most 64 points"),
     ],

@@ -15,6 +15,7 @@ from waiting import wait_until
 from gausslite.codec.ply import read_ply
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.relevance import PointedObject
+from gausslite.process import TASK_NOT_FOUND
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.uplink import Uplink
@@ -160,6 +161,17 @@ def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> 
         log = end(process, code=1).splitlines()
     (line,) = [line for line in log if " ERROR " in line]
     assert re.search(r"lost [1-9]\d* voxels and 0 keyframes that were not sent; --set spool=FILE keeps them", line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "code"), [("Pick up the cup", 0), ("Find the chair", TASK_NOT_FOUND)])
+def test_an_agent_that_found_nothing_of_its_task_ends_with_a_code_of_its_own(
+    tmp_path: Path, task: str, code: int
+) -> None:
+    with agent_process(tmp_path, *cup_options(tmp_path)) as (process, client):
+        client.assign_task(task)
+        list(client.ingest([red_frame(index) for index in range(6)]))
+        end(process, code=code)
 
 
 @pytest.mark.slow
