@@ -9,10 +9,13 @@ import time
 from typing import Any
 
 from gausslite.cli.progress import progress_bar
+from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mission.build import build_mapper, region_estimator
 from gausslite.mission.localisation_monitor import Admission, LocalisationState
@@ -144,13 +147,19 @@ class _Trials:
         return {"psnr": scores.full_psnr} | ({"region_psnr": scores.roi_psnr} if self._regions else {})
 
 
+def _open(address: str) -> Source:
+    """Return a recording, its depth registered to its colours as for a mission; nothing else is estimated."""
+    stated = StatedValues(correction=CameraCorrection(), pose_prior=PoseExposurePrior())
+    return open_calibrator().calibrate(open_source(address), stated).source
+
+
 def run_kidnaps(settings: KidnapSettings) -> Report:
     """Run the events, watched and not; good without a false alarm, a false place and a Gaussian of a watched one wrong.
 
     noticed, found: number of the first frame after the event that is not mapped as before, and that is mapped right.
     wrong: frames that are mapped at a wrong pose, wrong_gs: Gaussians that these add. psnr: of the frames before it.
     """
-    recording = Recording(open_source(settings.source), open_source(settings.elsewhere), settings)
+    recording = Recording(_open(settings.source), _open(settings.elsewhere), settings)
     before = recording.before()
     trials, team = _Trials(recording, before), TeamTrials(recording, before) if settings.robots > 1 else None
     rows, of_team = [], []

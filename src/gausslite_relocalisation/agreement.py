@@ -25,6 +25,7 @@ _WIDTH_PX, _POINT_STEP = 160, 2
 _OPAQUE_ALPHA, _MIN_COVERED = 0.7, 0.3
 _DEPTH_SHARE = 0.1
 _THROUGH_M, _THROUGH_SHARE = 0.1, 0.05
+_AROUND = np.ones((3, 3), np.uint8)
 _MIN_DEPTH, _MIN_TEXTURE = 0.65, 0.5
 _MAX_TEXTURE, _MIN_CONTRADICTED = 0.4, 0.1
 """At their own poses, images of the kitchen of 7-Scenes, of a HoloLens kitchenette and of a simulated home have depths
@@ -66,7 +67,9 @@ def compare(
     texture = texture_correlation(blurred_luminance(rgb), blurred_luminance(small.rgb), covered)
     if depth >= _MIN_DEPTH or texture >= _MAX_TEXTURE:
         return Agreement.AGREES if depth >= _MIN_DEPTH and texture >= _MIN_TEXTURE else Agreement.UNKNOWN
-    seen_through = covered & (depth_m > (1.0 + _DEPTH_SHARE) * map_m + _THROUGH_M)
+    # along a wall and beside a border, a pixel more or less is half a metre of depth
+    nearest_m, farthest_m = cv2.erode(depth_m, _AROUND), cv2.dilate(map_m, _AROUND)
+    seen_through = covered & (nearest_m > (1.0 + _DEPTH_SHARE) * farthest_m + _THROUGH_M)
     contradicted = np.count_nonzero(seen_through) / measured_px + _in_free_space(small, earlier)
     return Agreement.CONTRADICTS if contradicted >= _MIN_CONTRADICTED else Agreement.UNKNOWN
 

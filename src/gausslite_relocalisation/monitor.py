@@ -182,8 +182,11 @@ class FrameMonitor(LocalisationMonitor):
         self._doubtful += 1
         if self._doubtful >= _LOST_AFTER:
             self._localisation = LocalisationState.LOST
+            # of an odometry that has begun again, the first frames are the nearest to the map
+            offered = (*self._waiting, frame) if self._search is None else (frame,)
             self._search = self._search or PlaceSearch(mapper, self._prior, self._uplink)
-            T_map_odometry = self._search.offer(frame)
+            found = (self._search.offer(seen) for seen in offered)
+            T_map_odometry = next((T for T in found if T is not None), None)
             if T_map_odometry is not None:
                 return self._end_doubt(frame, T_map_odometry)
             if self._search.is_unknown and Piece.fits(mapper):

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from gausslite_relocalisation.team_places import TeamPart, TeamPlaces
 
 _ANOTHER_VIEW_M, _ANOTHER_VIEW_DEG = 0.15, 8.0
-"""A view that was not recognised is not tried again before the robot has moved this far."""
+_HALF_NEW_M, _HALF_NEW_DEG = 0.5, 20.0
+"""A view that was not recognised is not tried again before the robot has moved this far; the second ones for a place
+that is unknown, where each search would take longer than a frame's mapping."""
 _MIN_FEATURES = 40
 """Point features with a depth: a view with fewer, of a bare wall, says nothing about the place."""
 _CameraView = tuple[Camera, Float64[ndarray, "4 4"]]
@@ -78,7 +80,7 @@ class PlaceSearch:
             self._places = self._described(render, [*self._earlier, *part.views])
             # motions are in the same frame, but the view that was not recognised may be now
             self._localiser, self._failed = SequenceLocaliser(self._places), None
-        if self._failed is not None and _is_same_view(self._failed, frame):
+        if self._failed is not None and self._is_same_view(self._failed, frame):
             return None
         if self._localiser.is_done:
             self._localiser = SequenceLocaliser(self._places)
@@ -89,6 +91,11 @@ class PlaceSearch:
         self._unrecognised = 0 if is_recognised else self._unrecognised + _has_structure(frame)
         T_map_odometry = self._localiser.T_map_sequence
         return None if T_map_odometry is None else self._refined(frame, T_map_odometry)
+
+    def _is_same_view(self, a: Frame, b: Frame) -> bool:
+        far_m, far_deg = (_HALF_NEW_M, _HALF_NEW_DEG) if self.is_unknown else (_ANOTHER_VIEW_M, _ANOTHER_VIEW_DEG)
+        T_a, T_b = a.T_world_camera, b.T_world_camera
+        return translation_m(T_a, T_b) < far_m and rotation_angle_deg(T_a, T_b) < far_deg
 
     def _described(self, render: RenderMap, rendered: Sequence[_CameraView]) -> PlaceMap:
         """Return the places of a map: the keyframes, and rendered views."""
@@ -107,11 +114,6 @@ class PlaceSearch:
         nearest = min(self._keyframes, key=lambda keyframe: _distance(keyframe.T_world_camera, T_map_camera))
         T_nearest_camera = refined_by_images(nearest, frame, inverse(nearest.T_world_camera) @ T_map_camera)
         return orthonormal(nearest.T_world_camera @ T_nearest_camera @ inverse(frame.T_world_camera))
-
-
-def _is_same_view(a: Frame, b: Frame) -> bool:
-    moved_m = translation_m(a.T_world_camera, b.T_world_camera)
-    return moved_m < _ANOTHER_VIEW_M and rotation_angle_deg(a.T_world_camera, b.T_world_camera) < _ANOTHER_VIEW_DEG
 
 
 def _distance(T_a: Float64[ndarray, "4 4"], T_b: Float64[ndarray, "4 4"]) -> float:

@@ -83,14 +83,14 @@ def test_events_are_at_visits_of_the_tour(events: dict[str, tuple[int, ...]], me
 @pytest.mark.timeout(900)
 def test_a_tour_with_all_events_returns_to_a_home_that_was_on_disk(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (
-        "--homes 3 --laps 2 --frames 40 --width 160 --iterations 2 --max-gaussians 15000 --disk-mb 50 --json "
+        "--homes 3 --laps 2 --frames 40 --width 96 --iterations 2 --max-gaussians 8000 --disk-mb 50 --json "
         "--drift 0.1 --kidnaps 4 --restarts 3 --tasks 1,2"
     )
     assert main(["bench", "tour", *arguments.split()]) == 0
     report = json.loads(capsys.readouterr().out)
     visits = report["visits"]
     assert [row["home"] for row in visits] == [0, 1, 2, 1, 0, 1, 0]
-    assert max(row["in_memory"] for row in visits) <= 15_000
+    assert max(row["in_memory"] for row in visits) <= 8000
     assert visits[2]["gaussians"] > visits[2]["in_memory"]
     assert visits[0]["waited"] == 0
     assert report["poses"]["mapped"] > report["poses"]["frames"] / 2

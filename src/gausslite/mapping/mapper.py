@@ -204,6 +204,10 @@ class GaussianMapper:
         self._trainer.idle_step(window, self._extent_m)
         return True
 
+    def retrain(self, scheduler: StageScheduler) -> None:
+        """Train the window's views once more while there is time."""
+        self._trainer.retrain(self.pager.trainable(self.store.window), self._extent_m, scheduler)
+
     def reset_roi(self) -> None:
         """Start a new task: no Gaussian is active, and no keyframe is evaluated.
 

@@ -280,6 +280,8 @@ class TaskMapper:
             return self._skip(frame, admitted.reason)
         if admitted.joined is not None:
             self._mapper.restore(admitted.joined)
+            # neither map was trained on the other one's views, which show both now
+            self._mapper.retrain(self._scheduler)
         if admitted.T_map_odometry is not None:
             self._mapper.poses.T_corrected_odometry = admitted.T_map_odometry
         recovered = []
