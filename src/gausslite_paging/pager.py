@@ -8,7 +8,7 @@ group `gausslite.pagers`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -226,13 +226,13 @@ class DiskPager(MapPager):
         """Return a keyframe that does not train, with its images in a file while the disk has room."""
         return self._images.keep(keyframe, self._max_bytes - self.stored_bytes)
 
-    def with_stored(self, in_memory: Gaussians, use_ema: bool, active_only: bool, unsent_only: bool) -> Gaussians:
-        """Return these Gaussians and a copy of those on disk, as they are when they return."""
-        parts = [part for part in self._parts if not unsent_only or part.tile in self._unsent]
-        stored = [self._read(part).to_gaussians(use_ema=use_ema) for part in parts]
-        if not stored:
-            return in_memory
-        return Gaussians.concatenate([in_memory, *(g.take(g.active) if active_only else g for g in stored)])
+    def stored(self, use_ema: bool, unsent_only: bool = False, seen_by: Frame | None = None) -> Iterator[Gaussians]:
+        """Yield copies of the parts on disk, as they are when they return, one after the other."""
+        frustum = None if seen_by is None else Frustum.of(seen_by.camera, seen_by.T_world_camera, np.inf)
+        is_seen = [True] * len(self._parts) if frustum is None else frustum.sees(self._bounds_m()).tolist()
+        for part, chosen in zip(tuple(self._parts), is_seen, strict=True):
+            if chosen and (not unsent_only or part.tile in self._unsent):
+                yield self._read(part).to_gaussians(use_ema=use_ema)
 
     def mark_sent(self) -> None:
         """Note that what was stored so far was published."""

@@ -22,8 +22,10 @@ from room_tour import (
     tour_frames,
 )
 
+from gausslite.codec.ply import ply_bytes
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import transform_of
 from gausslite.domain.relevance import BallRegion
 from gausslite.domain.state import State
@@ -34,9 +36,11 @@ from gausslite.mapping.pose_corrector import LoopCounts
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import build_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mission.results import write_results
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import RegionRelevanceEstimator
+from gausslite.render.map_viewer import view_map
 from gausslite_paging.page_file import BLOCK_BYTES, PageFile
 from gausslite_paging.pager import DiskPager, _Tiles
 from gausslite_paging.visibility import Frustum
@@ -176,12 +180,18 @@ def test_the_disk_is_bounded_and_then_the_cap_holds(capsys: pytest.CaptureFixtur
     assert nothing.pager.count == 0
 
 
-def test_a_damaged_part_is_told_when_it_is_needed() -> None:
-    pager = disk_pager()
+def test_a_map_is_written_and_shown_part_by_part_and_a_damaged_part_is_told(tmp_path: Path) -> None:
+    pager, frame = disk_pager(), room_frame(FRAMES)
     mission = map_tour(rooms_mission(rooms_mapper(pager)), 0, AWAY)
+    write_results(tmp_path, mission.count, mission.parts(), {})
+    assert (tmp_path / "map.ply").read_bytes() == ply_bytes(mission.gaussians())
+    seen, whole = Gaussians.concatenate(list(mission.parts(seen_by=frame))), mission.gaussians()
+    assert 0 < len(seen) < len(whole)
+    assert len({view_map(part, threads=1).render_frame(frame).rgb.tobytes() for part in (seen, whole)}) == 1
     os.pwrite(pager._file._fd, b"\xff" * BLOCK_BYTES, 0)
     with pytest.raises(MapFileError, match="disk-mb: expected the map's parts"):
-        mission.gaussians()
+        write_results(tmp_path, mission.count, mission.parts(), {})
+    assert (tmp_path / "map.ply").read_bytes() == ply_bytes(whole)
 
 
 def test_voxels_of_teammates_meet_what_is_on_disk() -> None:
