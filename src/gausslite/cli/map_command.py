@@ -254,7 +254,7 @@ def _map_frames(
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
             for record in records:
-                record.add(outcome, mapper.poses, mapper.gaussians)
+                record.add(outcome, mapper.poses, mapper.parts)
             draw(outcome)
 
         mapped = run.map(print_above_bar, report, options.strict, options.save_state)
