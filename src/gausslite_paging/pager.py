@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -32,7 +32,7 @@ from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.task_change import clear_roi
 from gausslite.mapping.window_view import WindowView
 from gausslite.process import print_message, return_free_memory
-from gausslite.render.rasterizer import GRAD_2D_COUNT, LOG_SCALE
+from gausslite.render.rasterizer import GRAD_2D_COUNT, LOG_SCALE, QUAT
 from gausslite_paging.keyframe_images import KeyframeImages
 from gausslite_paging.page_file import Page, PageFile
 from gausslite_paging.visibility import Frustum, distances_m
@@ -65,6 +65,21 @@ def _packed(table: SplatTable, rows: Int64[ndarray, " m"]) -> NDArray[np.void]:
     for name, column in table.state().items():
         packed[name] = column[rows]
     return packed
+
+
+def _reach_m(table: SplatTable) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, "n 3"]]:
+    """Return the corners of the box of each Gaussian's pixels: a large flat one on a wall does not reach behind it."""
+    quats = table.rows[:, QUAT]
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    half_m = np.float32(_REACH_PER_SCALE) * np.linalg.norm(R * np.exp(table.rows[:, LOG_SCALE].T), axis=1).T
+    return table.means_m - half_m, table.means_m + half_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,12 +117,10 @@ class _Tiles:
         coarse = VoxelGrid(TILE_VOXELS * grid.size_m)
         index = VoxelIndex.from_points(table.means_m, coarse)
         names = tiles_of(grid.keys(coarse.centres_m(index.keys)))
-        scales = table.rows[:, LOG_SCALE].max(axis=1, initial=-np.inf)[index.rows]
-        largest_m = np.exp(np.maximum.reduceat(scales, index.starts)) if len(scales) else scales
-        reach_m = _REACH_PER_SCALE * largest_m.astype(np.float64)[:, None]
-        corners_m = coarse.indices(index.keys) * coarse.size_m
-        bounds_m = np.stack([corners_m - reach_m, corners_m + coarse.size_m + reach_m], axis=1)
-        return cls(index, names, bounds_m)
+        low_m, high_m = (bounds_m[index.rows] for bounds_m in _reach_m(table))
+        if len(names):
+            low_m, high_m = np.minimum.reduceat(low_m, index.starts), np.maximum.reduceat(high_m, index.starts)
+        return cls(index, names, np.stack([low_m, high_m], axis=1).astype(np.float64))
 
     def rows_of(self, tile: int) -> Int64[ndarray, " m"]:
         """Return the rows of the tile at this place."""
@@ -331,9 +344,8 @@ class DiskPager(MapPager):
             if page is None:
                 break
             self._file.release(part.page)
-            means_m = table.means_m.astype(np.float64)
-            reach_m = _REACH_PER_SCALE * np.exp(table.rows[:, LOG_SCALE].max())
-            bounds_m = np.stack([means_m.min(axis=0) - reach_m, means_m.max(axis=0) + reach_m])
+            low_m, high_m = _reach_m(table)
+            bounds_m = np.stack([low_m.min(axis=0), high_m.max(axis=0)]).astype(np.float64)
             stored = replace(part, page=page, corrections=self._corrected, tasks=self._tasks)
             self._parts[i] = replace(stored, bounds_m=bounds_m)
         self._forget_corrections()
