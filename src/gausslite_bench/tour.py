@@ -5,6 +5,7 @@ The robot's odometry may drift, it may be carried past homes and restart, and it
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from dataclasses import dataclass
@@ -95,6 +96,7 @@ class _Tour:
         path = self._building.folder / "agent.state"
         save_run(path, self.mission, ResumeConfig.of(self._mission_settings), 0)
         self._begin()
+        gc.collect()  # a new process has nothing of the old mission
         SavedRun.read(path).restore(self.mission)
 
     def visit(self, visit: Visit) -> dict[str, Any]:
