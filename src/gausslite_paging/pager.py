@@ -67,10 +67,10 @@ def _packed(table: SplatTable, rows: Int64[ndarray, " m"]) -> NDArray[np.void]:
     return packed
 
 
-def _reach_m(table: SplatTable) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, "n 3"]]:
+def _boxes_m(table: SplatTable) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, "n 3"]]:
     """Return the corners of the box of each Gaussian's pixels: a large flat one on a wall does not reach behind it."""
-    quats = table.rows[:, QUAT]
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    quats = np.ascontiguousarray(table.rows[:, QUAT].T)
+    w, x, y, z = quats / np.sqrt(np.square(quats).sum(axis=0))
     R = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -78,7 +78,7 @@ def _reach_m(table: SplatTable) -> tuple[Float32[ndarray, "n 3"], Float32[ndarra
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    half_m = np.float32(_REACH_PER_SCALE) * np.linalg.norm(R * np.exp(table.rows[:, LOG_SCALE].T), axis=1).T
+    half_m = np.float32(_REACH_PER_SCALE) * np.sqrt(np.square(R * np.exp(table.rows[:, LOG_SCALE].T)).sum(axis=1)).T
     return table.means_m - half_m, table.means_m + half_m
 
 
@@ -117,7 +117,7 @@ class _Tiles:
         coarse = VoxelGrid(TILE_VOXELS * grid.size_m)
         index = VoxelIndex.from_points(table.means_m, coarse)
         names = tiles_of(grid.keys(coarse.centres_m(index.keys)))
-        low_m, high_m = (bounds_m[index.rows] for bounds_m in _reach_m(table))
+        low_m, high_m = (bounds_m[index.rows] for bounds_m in _boxes_m(table))
         if len(names):
             low_m, high_m = np.minimum.reduceat(low_m, index.starts), np.maximum.reduceat(high_m, index.starts)
         return cls(index, names, np.stack([low_m, high_m], axis=1).astype(np.float64))
@@ -344,7 +344,7 @@ class DiskPager(MapPager):
             if page is None:
                 break
             self._file.release(part.page)
-            low_m, high_m = _reach_m(table)
+            low_m, high_m = _boxes_m(table)
             bounds_m = np.stack([low_m.min(axis=0), high_m.max(axis=0)]).astype(np.float64)
             stored = replace(part, page=page, corrections=self._corrected, tasks=self._tasks)
             self._parts[i] = replace(stored, bounds_m=bounds_m)
