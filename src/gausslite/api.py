@@ -241,7 +241,7 @@ def map_sequence(
         raise mapped.corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
     truth = ground_truth_notes(source.name, source) if task is not None and plan.perception.model is None else ()
     notes = (*truth, *as_recorded_notes(source), *skipped, *mapped.mapper.notes)
-    return MapResult(mapped.gaussians, mapped.result.summary(), notes)
+    return MapResult(mapped.mapper.gaussians(), mapped.result.summary(), notes)
 
 
 def save_ply(path: str | Path, gaussians: Gaussians, *, world_frame: str = "") -> None:

@@ -5,6 +5,7 @@ The robot's odometry may drift, it may be carried past homes and restart, and it
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import rotation_angle_deg, transform_points, translation_m
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import BallRegion
@@ -26,13 +28,14 @@ from gausslite.mission.results import peak_rss_mib
 from gausslite.mission.settings import DEFAULT_MAX_GAUSSIANS, MissionSettings, default_policy
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator, RegionRelevanceEstimator, RelevanceEstimator
+from gausslite.process import return_free_memory
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.map_viewer import MapViewer
 from gausslite_bench.quality.real_scenes import REAL_CAMERA
 from gausslite_bench.report import Report
 from gausslite_bench.service_process import resident_mib
-from gausslite_bench.tour_building import CARRIED_PAST, Building, Visit, planned_visits
-from gausslite_evaluation.compare import average, score_view
+from gausslite_bench.tour_building import CARRIED_PAST, Building, Visit, in_first_home, planned_visits
+from gausslite_evaluation.compare import ViewScore, average, score_view
 from gausslite_evaluation.views import HeldOutView, render_fitted
 from gausslite_paging.pager import DiskPager
 
@@ -93,12 +96,14 @@ class _Tour:
         path = self._building.folder / "agent.state"
         save_run(path, self.mission, ResumeConfig.of(self._mission_settings), 0)
         self._begin()
+        gc.collect()  # a new process has nothing of the old mission
         SavedRun.read(path).restore(self.mission)
 
     def visit(self, visit: Visit) -> dict[str, Any]:
         """Map the frames of a visit; return the figures at its end."""
         seconds, waited = [], 0
-        before = {"psnr_before": self.psnr()} if visit.home == 0 and visit.number else {}
+        is_return = visit.home == 0 and visit.number > 0
+        before = {f"{name}_before": value for name, value in self.psnr().items()} if is_return else {}
         if visit.number in self._settings.restarts:
             self._restart()
         needs_task = visit.number in self._settings.tasks
@@ -123,7 +128,7 @@ class _Tour:
             "longest_s": max(seconds),
             "hz": len(seconds) / sum(seconds),
             **before,
-            **({} if visit.home else {"psnr": self.psnr()}),
+            **({} if visit.home else self.psnr()),
         }
 
     def _assign(self, frame: Frame) -> None:
@@ -135,11 +140,15 @@ class _Tour:
         self._estimator = RegionRelevanceEstimator([BallRegion(tuple(target_m), _TARGET_M)])
         self.mission.assign(self._estimator)
 
-    def psnr(self) -> float:
+    def psnr(self) -> dict[str, float]:
         """Return the PSNR of the held-out views of the first home, at the poses that fit the map."""
-        viewer = MapViewer(self.mission.gaussians(), choose_rasterizer("auto", None))
-        views = (HeldOutView.of(frame, ()) for frame in self._building.views())
-        return average([score_view(render_fitted(viewer, view.frame), view) for view in views]).full_psnr
+        rasterizer, scores = choose_rasterizer("auto", None), {"psnr": list[ViewScore](), "psnr_alone": []}
+        for view in (HeldOutView.of(frame, ()) for frame in self._building.views()):
+            seen = Gaussians.concatenate(list(self.mission.parts(seen_by=view.frame)))
+            for own, part in zip(scores.values(), (seen, seen.take(in_first_home(seen.means_m))), strict=True):
+                own.append(score_view(render_fitted(MapViewer(part, rasterizer), view.frame), view))
+        return_free_memory()
+        return {name: average(own).full_psnr for name, own in scores.items()}
 
     def poses(self) -> dict[str, Any]:
         """Return the errors of all poses in the map, and the distances between frames of one place."""
@@ -160,6 +169,7 @@ class _Tour:
 def run_tour(settings: TourSettings) -> Report:
     """Go through all homes and back. psnr: of held-out views of the first home, also before each return to it.
 
+    Homes were recorded alone: no image shows what the map has behind thin walls. psnr_alone: of the home's own part.
     waited: frames that were not mapped when they came. wrong, returned_m: frames more than 0.3 m or 10 degrees from
     where the map had their place first, and the median distance. ate_m: RMS error of the positions.
     """

@@ -11,7 +11,7 @@ from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.cli.progress import progress_bar
@@ -21,7 +21,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_of
 from gausslite_sim.odometry_drift import drifting_poses
 
-_HOME_COUNT, _HOME_M = 8, 10.0
+_HOME_COUNT, _HOME_M, _NEXT_M = 8, 10.0, 8.0
 """Different homes; the next ones are the same with other objects and textures. Each is less than 7 m wide."""
 _HELD_OUT, _VIEWS, CORRIDOR_FRAMES = 2, 16, 12
 _CORRIDOR_M, _EYE_M, _STEP_M, _TILE_M = (8.0, 2.0, 2.5), (0.5, 1.0, 1.4), 0.5, 0.25
@@ -62,6 +62,12 @@ def corridor_frames(home: int, width: int) -> list[Frame]:
         T = np.array([[0, 0, 1, x_m], [-1, 0, 0, y_m], [0, -1, 0, z_m - _BELOW_M], [0, 0, 0, 1]])
         frames.append(Frame(i, 0, tiles[tuple(np.moveaxis(at, -1, 0))], depth_m.astype(np.float32), camera, T))
     return frames
+
+
+def in_first_home(points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+    """Return which points are nearer to the first home than to the next one and to the corridors."""
+    inside: Bool[ndarray, " n"] = (points_m[:, 0] < _NEXT_M) & (points_m[:, 2] > -_BELOW_M / 3)
+    return inside
 
 
 def record(path: str, home: int, width: int, frames: int, trajectory: int = 0) -> None:

@@ -25,7 +25,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack
 from gausslite.domain.relevance import Region, largest_roi_per_segment
-from gausslite.mission.evaluation import TrainingFit
+from gausslite.mission.evaluation import RenderFrame, TrainingFit
 from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 from gausslite_evaluation.lpips import Lpips
@@ -100,7 +100,7 @@ def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Ras
 
 
 def score_training_views(
-    viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]], count: int = 5
+    render: RenderFrame, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]], count: int = 5
 ) -> TrainingFit:
     """Return the PSNR over the keyframes with the largest region in each part of a run, at most `count`.
 
@@ -110,7 +110,7 @@ def score_training_views(
     in_region, in_images = [], []
     for i in sorted(largest_roi_per_segment(pixels, count)):
         view = HeldOutView(*keyframes[i])
-        rgb = viewer.render_frame(view.frame).rgb
+        rgb = render(view.frame).rgb
         in_images.append(min(psnr(rgb, view.frame.rgb), MAX_PSNR_DB))
         if view.shows_region:
             in_region.append(min(psnr(rgb, view.frame.rgb, view.roi), MAX_PSNR_DB))

@@ -10,8 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
-from gausslite.mission.evaluation import TrainingFit, TrajectoryError
-from gausslite.render.map_viewer import MapViewer
+from gausslite.mission.evaluation import RenderFrame, TrainingFit, TrajectoryError
 from gausslite_evaluation.compare import score_training_views
 from gausslite_evaluation.metrics import trajectory_error
 from gausslite_evaluation.pictures import render_preview
@@ -20,15 +19,15 @@ from gausslite_evaluation.pictures import render_preview
 class RunEvaluator:
     """Implements `gausslite.mission.evaluation.Evaluator`."""
 
-    def training_fit(self, viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]) -> TrainingFit:
+    def training_fit(self, render: RenderFrame, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]) -> TrainingFit:
         """Return the PSNR over five keyframes."""
-        return score_training_views(viewer, keyframes)
+        return score_training_views(render, keyframes)
 
     def preview(
-        self, viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
+        self, render: RenderFrame, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
     ) -> UInt8[ndarray, "H W 3"]:
         """Return photographs and renderings of three keyframes."""
-        return render_preview(viewer, keyframes)
+        return render_preview(render, keyframes)
 
     def trajectory_error(self, estimated: Trajectory, reference: Trajectory) -> TrajectoryError | None:
         """Return the ATE; None with fewer than 3 poses at times of the reference."""

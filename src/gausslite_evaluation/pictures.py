@@ -11,7 +11,7 @@ from numpy import ndarray
 from gausslite.domain.arrays import require_array
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import largest_roi_per_segment
-from gausslite.render.map_viewer import MapViewer
+from gausslite.mission.evaluation import RenderFrame
 from gausslite_evaluation.views import HeldOutView
 
 _HEADER_PX = 26
@@ -156,7 +156,7 @@ _ROWS = 3
 
 
 def render_preview(
-    viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
+    render: RenderFrame, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
 ) -> UInt8[ndarray, "H W 3"]:
     """Return an image with one row per third of the mission, in the keyframes' refined poses and exposures.
 
@@ -167,6 +167,5 @@ def render_preview(
     chosen = largest_roi_per_segment(roi_pixels, _ROWS)
     rows = []
     for frame, roi in (keyframes[i] for i in sorted(chosen)):
-        rendering = viewer.render_frame(frame)
-        rows.append(comparison_row(frame.rgb, rendering.rgb, roi, f"frame {frame.index}"))
+        rows.append(comparison_row(frame.rgb, render(frame).rgb, roi, f"frame {frame.index}"))
     return arrange_grid(rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +45,7 @@ _MAX_DEPTH_IMAGES = 400
 class DepthRecord:
     """Writes the reduced depth of a run's keyframes."""
 
-    def add(self, _outcome: FrameOutcome, _poses: PoseTable, _gaussians: Callable[[], Gaussians]) -> None:
+    def add(self, _outcome: FrameOutcome, _poses: PoseTable, _parts: Callable[[], Iterable[Gaussians]]) -> None:
         """Take nothing of a frame: keyframes have the depth."""
 
     def write(self, folder: Path, keyframes: Sequence[Keyframe]) -> None:

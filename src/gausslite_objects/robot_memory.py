@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
@@ -123,7 +123,7 @@ class RobotPlace:
         """Return the robot's objects after all edits."""
         return apply_edits(self._worker.status().found, self.edits())
 
-    def add(self, _outcome: FrameOutcome, _poses: PoseTable, _gaussians: Callable[[], Gaussians]) -> None:
+    def add(self, _outcome: FrameOutcome, _poses: PoseTable, _parts: Callable[[], Iterable[Gaussians]]) -> None:
         """Take nothing of a frame."""
 
     def write(self, folder: Path, _keyframes: Sequence[Keyframe]) -> None:

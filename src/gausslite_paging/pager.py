@@ -8,12 +8,12 @@ group `gausslite.pagers`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -32,7 +32,7 @@ from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.task_change import clear_roi
 from gausslite.mapping.window_view import WindowView
 from gausslite.process import print_message, return_free_memory
-from gausslite.render.rasterizer import GRAD_2D_COUNT, LOG_SCALE
+from gausslite.render.rasterizer import GRAD_2D_COUNT, LOG_SCALE, QUAT
 from gausslite_paging.keyframe_images import KeyframeImages
 from gausslite_paging.page_file import Page, PageFile
 from gausslite_paging.visibility import Frustum, distances_m
@@ -65,6 +65,21 @@ def _packed(table: SplatTable, rows: Int64[ndarray, " m"]) -> NDArray[np.void]:
     for name, column in table.state().items():
         packed[name] = column[rows]
     return packed
+
+
+def _boxes_m(table: SplatTable) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, "n 3"]]:
+    """Return the corners of the box of each Gaussian's pixels: a large flat one on a wall does not reach behind it."""
+    quats = np.ascontiguousarray(table.rows[:, QUAT].T)
+    w, x, y, z = quats / np.sqrt(np.square(quats).sum(axis=0))
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    half_m = np.float32(_REACH_PER_SCALE) * np.sqrt(np.square(R * np.exp(table.rows[:, LOG_SCALE].T)).sum(axis=1)).T
+    return table.means_m - half_m, table.means_m + half_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,12 +117,10 @@ class _Tiles:
         coarse = VoxelGrid(TILE_VOXELS * grid.size_m)
         index = VoxelIndex.from_points(table.means_m, coarse)
         names = tiles_of(grid.keys(coarse.centres_m(index.keys)))
-        scales = table.rows[:, LOG_SCALE].max(axis=1, initial=-np.inf)[index.rows]
-        largest_m = np.exp(np.maximum.reduceat(scales, index.starts)) if len(scales) else scales
-        reach_m = _REACH_PER_SCALE * largest_m.astype(np.float64)[:, None]
-        corners_m = coarse.indices(index.keys) * coarse.size_m
-        bounds_m = np.stack([corners_m - reach_m, corners_m + coarse.size_m + reach_m], axis=1)
-        return cls(index, names, bounds_m)
+        low_m, high_m = (bounds_m[index.rows] for bounds_m in _boxes_m(table))
+        if len(names):
+            low_m, high_m = np.minimum.reduceat(low_m, index.starts), np.maximum.reduceat(high_m, index.starts)
+        return cls(index, names, np.stack([low_m, high_m], axis=1).astype(np.float64))
 
     def rows_of(self, tile: int) -> Int64[ndarray, " m"]:
         """Return the rows of the tile at this place."""
@@ -226,13 +239,13 @@ class DiskPager(MapPager):
         """Return a keyframe that does not train, with its images in a file while the disk has room."""
         return self._images.keep(keyframe, self._max_bytes - self.stored_bytes)
 
-    def with_stored(self, in_memory: Gaussians, use_ema: bool, active_only: bool, unsent_only: bool) -> Gaussians:
-        """Return these Gaussians and a copy of those on disk, as they are when they return."""
-        parts = [part for part in self._parts if not unsent_only or part.tile in self._unsent]
-        stored = [self._read(part).to_gaussians(use_ema=use_ema) for part in parts]
-        if not stored:
-            return in_memory
-        return Gaussians.concatenate([in_memory, *(g.take(g.active) if active_only else g for g in stored)])
+    def stored(self, use_ema: bool, unsent_only: bool = False, seen_by: Frame | None = None) -> Iterator[Gaussians]:
+        """Yield copies of the parts on disk, as they are when they return, one after the other."""
+        frustum = None if seen_by is None else Frustum.of(seen_by.camera, seen_by.T_world_camera, np.inf)
+        is_seen = [True] * len(self._parts) if frustum is None else frustum.sees(self._bounds_m()).tolist()
+        for part, chosen in zip(tuple(self._parts), is_seen, strict=True):
+            if chosen and (not unsent_only or part.tile in self._unsent):
+                yield self._read(part).to_gaussians(use_ema=use_ema)
 
     def mark_sent(self) -> None:
         """Note that what was stored so far was published."""
@@ -331,9 +344,8 @@ class DiskPager(MapPager):
             if page is None:
                 break
             self._file.release(part.page)
-            means_m = table.means_m.astype(np.float64)
-            reach_m = _REACH_PER_SCALE * np.exp(table.rows[:, LOG_SCALE].max())
-            bounds_m = np.stack([means_m.min(axis=0) - reach_m, means_m.max(axis=0) + reach_m])
+            low_m, high_m = _boxes_m(table)
+            bounds_m = np.stack([low_m.min(axis=0), high_m.max(axis=0)]).astype(np.float64)
             stored = replace(part, page=page, corrections=self._corrected, tasks=self._tasks)
             self._parts[i] = replace(stored, bounds_m=bounds_m)
         self._forget_corrections()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray
@@ -25,6 +27,16 @@ def choose_gaussians(gaussians: Gaussians, limit: int) -> Int64[ndarray, " m"]:
     return np.sort(np.concatenate(parts))
 
 
+def choose_from_parts(parts: Iterable[Gaussians], limit: int) -> tuple[Gaussians, int]:
+    """Return the most important Gaussians of a map that is never in memory as a whole, and the number of all."""
+    chosen, total = Gaussians.empty(), 0
+    for part in parts:
+        chosen, total = Gaussians.concatenate([chosen, part]), total + len(part)
+        if len(chosen) > 2 * limit:
+            chosen = chosen.take(choose_gaussians(chosen, limit))
+    return chosen.take(choose_gaussians(chosen, limit)), total
+
+
 def _importance(gaussians: Gaussians) -> Float32[ndarray, " n"]:
     ordered = np.sort(gaussians.scales_m, axis=1)
     area: Float32[ndarray, " n"] = gaussians.opacities * ordered[:, 1] * ordered[:, 2]
@@ -32,8 +44,6 @@ def _importance(gaussians: Gaussians) -> Float32[ndarray, " n"]:
 
 
 def _top(rows: Int64[ndarray, " k"], importance: Float32[ndarray, " n"], count: int) -> Int64[ndarray, " c"]:
-    if count >= len(rows):
-        return rows
-    if count <= 0:
-        return rows[:0]
+    if not 0 < count < len(rows):
+        return rows[: max(count, 0)]
     return rows[np.argpartition(importance[rows], -count)[-count:]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,7 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite_view.even_history import EvenHistory
-from gausslite_view.important_gaussians import choose_gaussians
+from gausslite_view.important_gaussians import choose_from_parts
 
 _MAX_SNAPSHOTS, _LEAST_GAP_NS = 48, 250_000_000
 MAX_GAUSSIANS = 20_000
@@ -42,11 +42,11 @@ class MapSnapshot:
     message: bytes
 
     @classmethod
-    def of(cls, time_ns: int, gaussians: Gaussians) -> MapSnapshot:
+    def of(cls, time_ns: int, parts: Iterable[Gaussians]) -> MapSnapshot:
         """Encode the most important Gaussians. Raises InvalidInputError for a map that the codec cannot hold."""
-        chosen = gaussians.take(choose_gaussians(gaussians, MAX_GAUSSIANS))
+        chosen, total = choose_from_parts(parts, MAX_GAUSSIANS)
         subset = RoiSubset(_WRITER, _WRITER, 0, 0, group_by_voxel(chosen, _GRID))
-        return cls(time_ns, len(gaussians), encode_subset(subset, _GRID))
+        return cls(time_ns, total, encode_subset(subset, _GRID))
 
     def gaussians(self) -> Gaussians:
         """Decode the Gaussians. Raises CodecError."""
@@ -96,14 +96,14 @@ class MapRecorder:
 
     _snapshots: EvenHistory[MapSnapshot] = field(default_factory=lambda: EvenHistory(_MAX_SNAPSHOTS, _LEAST_GAP_NS))
 
-    def add(self, _outcome: FrameOutcome, poses: PoseTable, gaussians: Callable[[], Gaussians]) -> None:
+    def add(self, _outcome: FrameOutcome, poses: PoseTable, parts: Callable[[], Iterable[Gaussians]]) -> None:
         """Take a snapshot of the map after a frame, if one is due."""
         latest = poses.latest()
         if latest is None or not self._snapshots.is_due(latest.capture_time_ns):
             return
         # a map with a value that the codec refuses is still mapped further
         with suppress(InvalidInputError):
-            snapshot = MapSnapshot.of(latest.capture_time_ns, gaussians())
+            snapshot = MapSnapshot.of(latest.capture_time_ns, parts())
             self._snapshots.add(snapshot.time_ns, snapshot)
 
     def write(self, folder: Path, _keyframes: Sequence[Keyframe]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,7 +33,7 @@ class Timeline:
     max_rows: int = _MAX_ROWS
     _rows: list[tuple[float, ...]] = field(default_factory=list)
 
-    def add(self, outcome: FrameOutcome, _poses: PoseTable, _gaussians: Callable[[], Gaussians]) -> None:
+    def add(self, outcome: FrameOutcome, _poses: PoseTable, _parts: Callable[[], Iterable[Gaussians]]) -> None:
         """Add one frame. Frames that waited have rows, with the state of the robot when they came."""
         for waited in outcome.recovered:
             newest = range(len(self._rows) - 1, max(len(self._rows) - _MAX_WAITED, 0) - 1, -1)

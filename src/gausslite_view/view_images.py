@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,7 +86,7 @@ _PHOTOGRAPHS = 4
 class ViewRecord:
     """Writes the photographs of the keyframes with the largest region of each quarter of a run."""
 
-    def add(self, _outcome: FrameOutcome, _poses: PoseTable, _gaussians: Callable[[], Gaussians]) -> None:
+    def add(self, _outcome: FrameOutcome, _poses: PoseTable, _parts: Callable[[], Iterable[Gaussians]]) -> None:
         """Take nothing of a frame: keyframes have the photographs."""
 
     def write(self, folder: Path, keyframes: Sequence[Keyframe]) -> None:

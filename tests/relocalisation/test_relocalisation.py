@@ -142,11 +142,11 @@ def test_a_place_that_was_never_seen_changes_no_bit_of_the_map_and_the_mission_s
     lost = _moved(_frames(camera, UNSEEN * 5, first=len(HERE)), HERE[-1] @ inverse(UNSEEN[0]))
     for outcome in _process(mission, frames):
         totals.add(outcome)
-        timeline.add(outcome, PoseTable(), mission.gaussians)
+        timeline.add(outcome, PoseTable(), mission.parts)
     before = mission.gaussians()
     for outcome in _process(mission, lost):
         totals.add(outcome)
-        timeline.add(outcome, PoseTable(), mission.gaussians)
+        timeline.add(outcome, PoseTable(), mission.parts)
     assert np.array_equal(mission.gaussians().means_m, before.means_m)
     assert mission.localisation is LOST
     assert mission.notes == (

@@ -53,7 +53,7 @@ def run_folder(tmp_path):
     )
     write_ply(tmp_path / "map.ply", walls)
     history = [(0, walls.take(left)), (1_000_000_000, walls.take(left)), (2_000_000_000, walls)]
-    write_map_history(tmp_path, [MapSnapshot.of(time_ns, gaussians) for time_ns, gaussians in history])
+    write_map_history(tmp_path, [MapSnapshot.of(time_ns, [gaussians]) for time_ns, gaussians in history])
     camera = Camera(300.0, 300.0, 320.0, 240.0, 640, 480)
     write_keyframe_views(tmp_path, [KeyframeView(0, 0, camera, np.eye(4), 10)])
     mug = {

@@ -24,10 +24,10 @@ def add(poses: PoseTable, added: Frame) -> None:
 
 def test_snapshots_of_the_growing_map_are_written(tmp_path):
     recorder, poses = MapRecorder(), PoseTable()
-    recorder.add(None, poses, lambda: random_gaussians(1))
+    recorder.add(None, poses, lambda: [random_gaussians(1)])
     for index in range(30):
         add(poses, frame(index, index * 100_000_000))
-        recorder.add(None, poses, lambda count=index + 1: random_gaussians(count))
+        recorder.add(None, poses, lambda count=index + 1: [random_gaussians(count)])
     recorder.write(tmp_path, ())
     snapshots = read_map_history(tmp_path)
     assert [each.time_ns // 100_000_000 for each in snapshots] == list(range(0, 30, 3))
@@ -38,6 +38,6 @@ def test_a_map_that_the_codec_refuses_is_left_out(tmp_path):
     recorder, poses = MapRecorder(), PoseTable()
     add(poses, frame(0, 0))
     flat = replace(random_gaussians(5), scales_m=np.zeros((5, 3), np.float32))
-    recorder.add(None, poses, lambda: flat)
+    recorder.add(None, poses, lambda: [flat])
     recorder.write(tmp_path, ())
     assert read_map_history(tmp_path) == ()

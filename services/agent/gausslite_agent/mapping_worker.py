@@ -373,7 +373,7 @@ class MappingWorker:
         self._last_index = frame.index
         self._set_localisation(self._task_mapper.localisation)
         for record in self.records:
-            record.add(outcome, self._mapper.poses, self._mapper.gaussians)
+            record.add(outcome, self._mapper.poses, self._mapper.parts)
         self._update_notes(self._task_mapper.notes)
         self._update_objects(self._task_mapper.objects)
         if outcome.skipped is not None:

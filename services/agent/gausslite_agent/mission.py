@@ -12,9 +12,9 @@ from typing import Any
 from gausslite.codec.json import graph_as_json, noun_as_json, object_as_json
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, StorageError
 from gausslite.domain.frame import ClockJumps, Frame
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
 from gausslite.domain.task import TaskGraph, TaskParser
+from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.prior_map import compare_with_prior
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
@@ -49,10 +49,10 @@ NO_DETECTOR = (
 
 
 def mission_report(
-    agent_id: str, status: WorkerStatus, gaussians: Gaussians, uplink: UplinkCounters, seconds: float
+    agent_id: str, status: WorkerStatus, gaussians: int, active: int, uplink: UplinkCounters, seconds: float
 ) -> dict[str, object]:
     """Return the figures of a mission. map_shared_percent: of the Gaussians in the region; 0 if no update was sent."""
-    graph, active = status.graph, int(gaussians.active.sum())
+    graph = status.graph
     is_sent = uplink.subsets_sent > 0
     return {
         "agent_id": agent_id,
@@ -72,13 +72,13 @@ def mission_report(
         "frame_age_p50_s": status.age_s(50),
         "frame_age_p99_s": status.age_s(99),
         "seconds": seconds,
-        "gaussians": len(gaussians),
+        "gaussians": gaussians,
         "active_gaussians": active,
         "roi_share": status.roi_share,
         "bytes_sent": uplink.roi_bytes,
         **values_of(uplink, _REPORTED_UPLINK_COUNTERS),
         "uplink_stopped_because": uplink.stopped_because,
-        "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
+        "map_shared_percent": 100.0 * active / max(gaussians, 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),
         "team_gaussians_inserted": status.team_gaussians,
         "nouns": [noun_as_json(noun) for noun in status.nouns],
@@ -328,22 +328,21 @@ class AgentMission:
             self._send_all(self._worker.uplink, request)
         if self._stopping.is_set() and (self._settings.source is not None or self._was_stopped):
             ended_by = ended_by or _INTERRUPTED
-        gaussians = self._worker.run(lambda mapper: mapper.gaussians()).result()
+        gaussians = self._worker.run(lambda mapper: mapper.count).result()
         status, uplink = self._worker.status(), self._worker.uplink
         for note in (*status.noun_notes, *status.task_notes):
             _log.log(logging.INFO if note in status.noun_notes else logging.WARNING, "%s", note)
         counters = None if uplink is None else uplink.counters()
         if self._settings.out is not None and status.mapped > 0:
-            self._write_results(self._settings.out, gaussians, counters or UplinkCounters(), ended_by)
+            self._write_results(self._settings.out, counters or UplinkCounters(), ended_by)
         spool = self._settings.link.spool
-        return MissionSummary(status.mapped, status.hz, len(gaussians), ended_by, counters, spool)
+        return MissionSummary(status.mapped, status.hz, gaussians, ended_by, counters, spool)
 
-    def _write_results(
-        self, folder: Path, gaussians: Gaussians, counters: UplinkCounters, ended_by: str | None
-    ) -> None:
-        seconds = time.monotonic() - self._start_s
+    def _write_results(self, folder: Path, counters: UplinkCounters, ended_by: str | None) -> None:
+        seconds, status = time.monotonic() - self._start_s, self._worker.status()
+        sizes = self._worker.run(lambda mapper: (mapper.count, len(mapper.gaussians(active_only=True)))).result()
         report: dict[str, Any] = {
-            **mission_report(self._settings.agent_id, self._worker.status(), gaussians, counters, seconds),
+            **mission_report(self._settings.agent_id, status, *sizes, counters, seconds),
             "up": list(self._up_axis),
             "frames_corrupt": self._corrupt.count,
             "memory_mib": self._worker.run(lambda mapper: mapper.memory_mib()).result(),
@@ -353,12 +352,14 @@ class AgentMission:
         report["notes"] = [*self._source_notes, *report["notes"]]
         prior = self._worker.prior
         keyframes = self._worker.run(lambda mapper: mapper.store.kept).result()
-        changes = compare_with_prior(prior, gaussians, self._worker.status().found, keyframes)
+        changes = compare_with_prior(
+            prior, lambda: self._worker.run(GaussianMapper.gaussians).result(), status.found, keyframes
+        )
         for line in changes.lines:
             _log.info("since the earlier map: %s", line)
         report |= {**changes.report, "objects": [object_as_json(landmark) for landmark in changes.objects]}
         world_frame = self._settings.link.uplink.world_frame or ("" if prior is None else prior.world_frame)
-        write_results(folder, gaussians, report, world_frame)
+        self._worker.run(lambda own: write_results(folder, own.count, own.parts(), report, world_frame)).result()
         motion = None if prior is None else prior.motion
         self._worker.run(lambda mapper: write_poses(folder, mapper.poses, motion)).result()
         write_keyframes(folder, keyframes)

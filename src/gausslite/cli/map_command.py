@@ -22,7 +22,8 @@ from gausslite.datasets.open import default_world_frame, open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
-from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR, TOO_FAR
+from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR, TOO_FAR, Frame
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import found_text
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.task import TaskGraph
@@ -59,6 +60,7 @@ from gausslite.pages import BeginView, load_pages
 from gausslite.plugins import Group, load
 from gausslite.process import ROBOT_LOST, TASK_NOT_FOUND, DeferredInterrupt
 from gausslite.render.map_viewer import view_map
+from gausslite.render.rasterizer import Rendering
 from gausslite.wire.channel import MAX_PORT
 
 _SKIPS = {
@@ -252,13 +254,13 @@ def _map_frames(
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
             for record in records:
-                record.add(outcome, mapper.poses, mapper.gaussians)
+                record.add(outcome, mapper.poses, mapper.parts)
             draw(outcome)
 
         mapped = run.map(print_above_bar, report, options.strict, options.save_state)
     if mapped.result.processed == 0 and mapped.corrupt.first_error is not None:
         raise mapped.corrupt.first_error
-    if len(mapped.gaussians) == 0 and mapped.result.processed > 0:
+    if mapper.count == 0 and mapped.result.processed > 0:
         require_mappable_depth(mapped)
     return mapped
 
@@ -278,7 +280,7 @@ def _write_results(options: argparse.Namespace, mapped: MappedRun, records: Sequ
     out, mapper, mission, prior = options.out, mapped.mapper, mapped.run.plan.mission, mapped.run.prior
     keyframes = mapper.keyframes()
     evaluator, missing = _evaluator()
-    changes = compare_with_prior(prior, mapped.gaussians, mapper.objects, keyframes)
+    changes = compare_with_prior(prior, mapper.gaussians, mapper.objects, keyframes)
     notes = (*missing, *_notes(options, mapped))
     report: dict[str, object] = {
         **mapped.report(trajectory_report(mapped, evaluator)),
@@ -288,20 +290,24 @@ def _write_results(options: argparse.Namespace, mapped: MappedRun, records: Sequ
         **changes.report,
     }
     prepare_folder(out)
-    viewer = view_map(mapped.gaussians, mission.backend, mission.threads)
+
+    def render(frame: Frame) -> Rendering:
+        seen = Gaussians.concatenate(list(mapper.parts(seen_by=frame)))
+        return view_map(seen, mission.backend, mission.threads).render_frame(frame)
+
     views = [(keyframe.frame, keyframe.relevance.roi) for keyframe in keyframes]
-    scores = evaluator.training_fit(viewer, views) if evaluator is not None and views else None
+    scores = evaluator.training_fit(render, views) if evaluator is not None and views else None
     if scores is not None:
         report["training_views"] = asdict(scores)
     stated = options.world_frame
     world_frame = default_world_frame(mapped.run.stream.source) if stated is None else str(stated)
-    write_results(out, mapped.gaussians, report, world_frame)
+    write_results(out, mapper.count, mapper.parts(), report, world_frame)
     write_poses(out, mapper.poses, None if prior is None else prior.motion)
     write_keyframes(out, keyframes)
     for record in records:
         record.write(out, keyframes)
     if evaluator is not None and views:
-        write_png(out / PREVIEW, evaluator.preview(viewer, views))
+        write_png(out / PREVIEW, evaluator.preview(render, views))
     return _Written(report, notes, changes.lines, scores)
 
 
@@ -333,7 +339,7 @@ def _print_results(options: argparse.Namespace, mapped: MappedRun, written: _Wri
     shown = "" if written.scores is None else f"; {PREVIEW} in the same folder shows it"
     print(
         f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {totals.hz:.1f} Hz, "
-        f"{len(mapped.gaussians):,} Gaussians{in_region} → {options.out / 'map.ply'}{shown}"
+        f"{mapped.mapper.count:,} Gaussians{in_region} → {options.out / 'map.ply'}{shown}"
     )
     if totals.late:
         print(f"  {totals.late} of {totals.frames} frames missed the deadline of --rate {options.rate:g}")
@@ -351,8 +357,7 @@ def _print_results(options: argparse.Namespace, mapped: MappedRun, written: _Wri
 
 def _outcome(mapped: MappedRun, scores: TrainingFit | None) -> str:
     """Return what was found, where, and how good the map is on views that it was trained on."""
-    graph, gaussians, mapper = mapped.run.scheduled.graph, mapped.gaussians, mapped.mapper
-    region_m = gaussians.means_m[gaussians.active]
+    graph, region_m, mapper = mapped.run.scheduled.graph, mapped.region.means_m, mapped.mapper
     parts = [] if graph is None else [f"found: {found_text(mapper.objects, graph.targets, region_m, mapper.nouns)}"]
     if scores is not None:
         in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "

@@ -12,8 +12,9 @@ An opacity of ±infinity is 1 or 0, a scale of -infinity is flat. The header may
 from __future__ import annotations
 
 import contextlib
+import itertools
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -92,6 +93,12 @@ def write_ply(
     write_atomic(path, ply_bytes(gaussians, world_frame, harmonics))
 
 
+def write_ply_parts(path: Path, count: int, parts: Iterable[Gaussians], world_frame: str = "") -> None:
+    """Write the map whose parts have so many Gaussians, one part after the other. Raises as `write_ply`."""
+    header = _header(count, _rows(Gaussians.empty()), world_frame)
+    write_atomic(path, itertools.chain([header], (_rows(part).tobytes() for part in parts)))
+
+
 def read_ply(path: Path, warn: Callable[[str], object] = warnings.warn) -> Gaussians:
     """Read a map without harmonics. Rows with NaN, or infinite where no map can be, are left out.
 
@@ -119,7 +126,11 @@ def read_world_frame(path: Path) -> str:
 
 def ply_bytes(gaussians: Gaussians, world_frame: str = "", harmonics: Float32[ndarray, "n 3 k"] | None = None) -> bytes:
     """Encode the map as the bytes of a PLY file. Raises InvalidInputError as `write_ply`."""
-    require_name("world frame", world_frame)
+    rows = _rows(gaussians, harmonics)
+    return _header(len(rows), rows, world_frame) + rows.tobytes()
+
+
+def _rows(gaussians: Gaussians, harmonics: Float32[ndarray, "n 3 k"] | None = None) -> NDArray[Any]:
     rest_names = () if harmonics is None else tuple(f"{_REST}{i}" for i in range(3 * harmonics.shape[2]))
     names = (*_POSITIONS, *_COLOURS, *rest_names, "opacity", *_SCALES, *_ROTATIONS, *_EXTRAS)
     rows = np.zeros(len(gaussians), [(name, "<f4") for name in names])
@@ -133,12 +144,18 @@ def ply_bytes(gaussians: Gaussians, world_frame: str = "", harmonics: Float32[nd
     rows["opacity"] = np.log(opacity / (1 - opacity))
     for name in _EXTRAS:
         rows[name] = getattr(gaussians, name)
+    return rows
+
+
+def _header(count: int, rows: NDArray[Any], world_frame: str) -> bytes:
+    """Return the header of a file with so many rows like these."""
+    require_name("world frame", world_frame)
     header = ["ply", "format binary_little_endian 1.0"]
     if world_frame:
         header.append(_WORLD_FRAME_COMMENT + quote(world_frame, _PRINTABLE))
-    header.append(f"element vertex {len(gaussians)}")
-    header += [f"property float {name}" for name in names]
-    return ("\n".join([*header, "end_header"]) + "\n").encode("ascii") + rows.tobytes()
+    header.append(f"element vertex {count}")
+    header += [f"property float {name}" for name in rows.dtype.names or ()]
+    return ("\n".join([*header, "end_header"]) + "\n").encode("ascii")
 
 
 def world_frame_from_ply(data: bytes) -> str:

@@ -11,7 +11,7 @@ import contextlib
 import fcntl
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +32,23 @@ _LENGTH_BYTES, _MAX_HEADER_BYTES = 8, 1 << 24
 """A safetensors file begins with the length of its JSON header, which is checked before anything is allocated."""
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write the bytes to a temporary file in the same folder, then rename it to `path`.
+def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
+    """Write the bytes, or one block after the other, to a temporary file in the same folder; rename it to `path`.
 
     A device or pipe is written to directly. Raises StorageError if the folder is not writable or the disk is full.
     """
+
+    def write(to: Path) -> None:
+        with to.open("wb") as file:
+            file.writelines((data,) if isinstance(data, bytes) else data)
+
     try:
         if path.exists() and not path.is_file():
-            path.write_bytes(data)
+            write(path)
             return
     except OSError as error:
         raise _cannot_write(path, error) from error
-    write_atomic_with(path, lambda temporary: temporary.write_bytes(data))
+    write_atomic_with(path, write)
 
 
 def write_atomic_with(path: Path, write: Callable[[Path], object], mode: int = 0o644) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -272,14 +273,22 @@ class GaussianMapper:
     def _render(self, camera: Camera, T_world_camera: _Pose, motion: CameraMotion | None = None) -> Rendering:
         return self.rasterizer.forward(self.table.rows, camera, inverse(T_world_camera), motion=motion)
 
-    def gaussians(self, active_only: bool = False, unsent_only: bool = False) -> Gaussians:
-        """Return a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0.
+    def parts(
+        self, active_only: bool = False, unsent_only: bool = False, seen_by: Frame | None = None
+    ) -> Iterator[Gaussians]:
+        """Yield a copy of the map as physical values, averaged if `OptimizationSettings.ema_updates` is above 0.
 
-        unsent_only: without what was published and is on disk.
+        First what is in memory, then each part on disk. unsent_only: without what was published and is on disk;
+        seen_by: without what is on disk where this frame's camera does not look.
         """
         rows = np.flatnonzero(self.table.active) if active_only else None
-        gaussians = self.table.to_gaussians(rows, use_ema := self.settings.optimization.ema_updates > 0)
-        return self.pager.with_stored(gaussians, use_ema, active_only, unsent_only)
+        yield self.table.to_gaussians(rows, use_ema := self.settings.optimization.ema_updates > 0)
+        for part in self.pager.stored(use_ema, unsent_only, seen_by):
+            yield part.take(part.active) if active_only else part
+
+    def gaussians(self, active_only: bool = False, unsent_only: bool = False) -> Gaussians:
+        """Return all of `parts` at once."""
+        return Gaussians.concatenate(list(self.parts(active_only, unsent_only)))
 
     def memory_mib(self) -> dict[str, float]:
         """Return the memory in MiB of the table, of Adam's moments and of the keyframes' images."""

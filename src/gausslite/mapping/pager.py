@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
@@ -50,9 +52,9 @@ class MapPager:
         """Return a keyframe that does not train; its images may be in a file."""
         return keyframe
 
-    def with_stored(self, in_memory: Gaussians, use_ema: bool, active_only: bool, unsent_only: bool) -> Gaussians:
-        """Return these Gaussians and a copy of those on disk. unsent_only: of those stored since `mark_sent`."""
-        return in_memory
+    def stored(self, use_ema: bool, unsent_only: bool = False, seen_by: Frame | None = None) -> Iterator[Gaussians]:
+        """Yield copies of the parts on disk. unsent_only: stored since `mark_sent`; seen_by: that a camera may see."""
+        return iter(())
 
     def mark_sent(self) -> None:
         """Note that what was stored so far was published."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -11,7 +11,9 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
-from gausslite.render.map_viewer import MapViewer
+from gausslite.render.rasterizer import Rendering
+
+RenderFrame = Callable[[Frame], Rendering]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +38,15 @@ class TrajectoryError:
 class Evaluator(Protocol):
     """A plug-in that `map` asks at its end; without one, `map` leaves out the figures and the picture.
 
-    keyframes: frames in temporal order, at least one, each with the mask of the task's region.
+    render: returns what the map shows in a frame's view. keyframes: frames in temporal order, at least one, each with
+    the mask of the task's region.
     """
 
-    def training_fit(self, viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]) -> TrainingFit:
+    def training_fit(self, render: RenderFrame, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]) -> TrainingFit:
         """Return how well the map fits keyframes that it was trained on."""
 
     def preview(
-        self, viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
+        self, render: RenderFrame, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
     ) -> UInt8[ndarray, "H W 3"]:
         """Return a picture of some keyframes beside the map's rendering."""
 

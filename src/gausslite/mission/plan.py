@@ -243,7 +243,7 @@ class OpenRun:
         corrupt = CorruptFrames(report)
         frames = self.stream.frames(None if strict else corrupt)
         result = MissionRunner(self.scheduled.process, on_frame).run(frames, self.scheduled.last_index)
-        mapped = MappedRun(self, result, corrupt, self.scheduled.mapper.gaussians())
+        mapped = MappedRun(self, result, corrupt, self.scheduled.mapper.gaussians(active_only=True))
         if save_state is None or not mapped.is_worth_keeping:
             return mapped
         try:
@@ -296,7 +296,7 @@ class MappedRun:
     run: OpenRun
     result: MissionResult
     corrupt: CorruptFrames  # frames that could not be read
-    gaussians: Gaussians
+    region: Gaussians  # those of the task
     save_error: StorageError | None = None  # why it could not be saved
 
     @property
@@ -321,8 +321,8 @@ class MappedRun:
             "loops": asdict(self.mapper.loops),
             "localisation": self.mapper.localisation.name.lower(),
             "frames_corrupt": self.corrupt.count,
-            "gaussians": len(self.gaussians),
-            "active_gaussians": int(self.gaussians.active.sum()),
+            "gaussians": self.mapper.count,
+            "active_gaussians": len(self.region),
             "peak_rss_mib": peak_rss_mib(),
             "memory_mib": self.mapper.memory_mib(),
         }

@@ -94,9 +94,9 @@ def open_prior_map(folder: Path | None, saved: State, settings: MissionSettings)
 
 def compare_with_prior(
     prior: PriorMap | None,
-    gaussians: Gaussians,
+    gaussians: Callable[[], Gaussians],
     objects: Sequence[ObjectLandmark],
     keyframes: Sequence[Keyframe],
 ) -> MapChanges:
     """Return what changed since the earlier map; without one, the run's own objects."""
-    return MapChanges(objects) if prior is None else prior.compare(gaussians, objects, keyframes)
+    return MapChanges(objects) if prior is None else prior.compare(gaussians(), objects, keyframes)

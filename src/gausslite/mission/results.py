@@ -9,7 +9,7 @@ import math
 import os
 import resource
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.ply import write_ply
+from gausslite.codec.ply import write_ply_parts
 from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.codec.state_file import write_atomic
@@ -127,14 +127,16 @@ def require_absent(path: Path) -> None:
         raise StorageError(f"{path} exists already; choose another --out, or replace it with --overwrite")
 
 
-def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object], world_frame: str = "") -> None:
-    """Write map.ply, with the name of its world frame, and report.json. Raises StorageError.
+def write_results(
+    folder: Path, count: int, parts: Iterable[Gaussians], report: Mapping[str, object], world_frame: str = ""
+) -> None:
+    """Write map.ply, whose parts have so many Gaussians, and report.json. Raises StorageError, errors of the parts.
 
     An earlier map's evaluation.json is removed, because its scores are not those of this map.
     """
     with contextlib.suppress(OSError):
         (folder / EVALUATION).unlink()
-    write_ply(folder / MAP, gaussians, world_frame)
+    write_ply_parts(folder / MAP, count, parts, world_frame)
     write_json(folder / _REPORT, report)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -16,8 +16,8 @@ from gausslite.plugins import Group, installed
 class RunRecord(Protocol):
     """Writes a file beside the map of one run; a plug-in of `gausslite.run_records` is a class without arguments."""
 
-    def add(self, outcome: FrameOutcome, poses: PoseTable, gaussians: Callable[[], Gaussians], /) -> None:
-        """Take what the file needs of a processed frame. gaussians: returns the map."""
+    def add(self, outcome: FrameOutcome, poses: PoseTable, parts: Callable[[], Iterable[Gaussians]], /) -> None:
+        """Take what the file needs of a processed frame. parts: yields the map."""
 
     def write(self, folder: Path, keyframes: Sequence[Keyframe], /) -> None:
         """Write the file after the last frame. keyframes: oldest first. Raises StorageError."""

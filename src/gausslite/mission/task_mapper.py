@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -190,9 +190,18 @@ class TaskMapper:
             self._sent_voxels.mark_received(inserted.batch)
         return inserted
 
-    def gaussians(self) -> Gaussians:
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in memory and on disk."""
+        return self._mapper.count
+
+    def gaussians(self, active_only: bool = False) -> Gaussians:
         """Return a copy of the map."""
-        return self._mapper.gaussians()
+        return self._mapper.gaussians(active_only)
+
+    def parts(self, seen_by: Frame | None = None) -> Iterator[Gaussians]:
+        """Yield a copy of the map in parts; see `GaussianMapper.parts`."""
+        return self._mapper.parts(seen_by=seen_by)
 
     def render(
         self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
