@@ -13,14 +13,9 @@ from gausslite.render.rasterizer import AdamSettings, LossWeights
 ONLINE_RATES = AdamSettings(
     means=6e-4, log_scales=4e-2, quats=8e-3, opacity_logits=5e-2, rgb=2e-2, decay_after_updates=150
 )
-"""Learning rates for Gaussians with a few dozen iterations. Those of shape and colour are 8 times the 3DGS rates,
-those of the means 6 times. With the 3DGS rates small seeds do not grow enough to blend. On a real kitchen
-(320x240, 8 iterations per frame) these rates gain 1.7 dB in the region of interest, and as much for uniform
-mapping. Means that move 6 times instead of twice as fast gain 0.2 dB in the region and 0.5 dB over the whole image.
-
-They decay from the 150th update of a Gaussian on: with constant rates, Gaussians oscillate between views, and more
-iterations make a region worse. A decay from the 50th update on loses 0.3 dB over the whole images of a HoloLens
-recording at 32 iterations per frame.
+"""Learning rates for Gaussians with a few dozen iterations: 8 times those of 3DGS for shape and colour, 6 times for
+means. With those of 3DGS, small seeds do not grow enough to blend. They decay from the 150th update of a Gaussian on:
+with constant rates, Gaussians oscillate between views, and more iterations make a region worse (bench/results).
 """
 BALANCED_LOSS = LossWeights(normalise_by_image=True)
 

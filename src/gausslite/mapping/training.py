@@ -1,9 +1,8 @@
 """Train the map on a frame: warm-up over full images, then the ROI alone (Sec. III-D.1, ROI; III-D.2, MVO; Eq. 2).
 
-Saturation: the loss of an active iteration is compared with that of the previous one on the same view, so that easy and
-hard views do not mix. The improvement per visit starts above 0.1 in a new region and falls where views contradict each
-other. On real cameras, iterations that are then released cost the region nothing. The rest of the image gains 1 to 6
-dB, and poses are fitted to all of it (bench/results).
+Saturation: the loss of an active iteration is compared with that of the previous one on the same view. The improvement
+per visit starts above 0.1 in a new region and falls where views contradict each other. On real cameras, iterations that
+are then released cost the region nothing, and the rest of the image gains 1 to 6 dB (bench/results).
 """
 
 from __future__ import annotations
