@@ -18,8 +18,7 @@ from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, installed, load, names
 
-_MAX_LISTED, _MAX_NAMED = 1000, 5
-"""Entries of a folder among which sequences are looked for, and of them those that a message names."""
+_MAX_LISTED, _MAX_NAMED = 1000, 5  # entries of a folder that may be sequences, and of them those that a message names
 _TUM: Final[SourceReader] = FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)")
 
 
@@ -96,9 +95,9 @@ def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
         raise DatasetError(f"{folder}: holds {len(inside)} sequences; expected one of them: {found}")
     if not any(folder.iterdir()):
         raise DatasetError(f"{folder}: expected a sequence, got an empty folder")
-    deeper = [str(path) for pattern in ("*/*", "*/*/*") for _, path in sequences_among(folder.glob(pattern))[:_MAX_NAMED]]
-    if deeper:
-        raise DatasetError(f"{folder}: holds sequences deeper inside; expected {_alternatives(deeper)}")
+    if deeper := [*sequences_among(folder.glob("*/*")), *sequences_among(folder.glob("*/*/*"))][:_MAX_NAMED]:
+        found = _alternatives([str(path) for _, path in deeper])
+        raise DatasetError(f"{folder}: holds sequences deeper inside; expected {found}")
     layouts = _alternatives([reader.layout for reader in _readers()])
     raise DatasetError(f"{folder}: unknown layout; expected {layouts}{_absent_readers()}")
 
