@@ -84,8 +84,9 @@ def _plot(top: float, steps: Sequence[str], plotted: Sequence[Curve]) -> Iterato
     for share in (0.0, 1.0):
         place = f'x="{_MARGIN - 6:g}" y="{bottom - share * height:.1f}"'
         yield f'<text {place} text-anchor="end">{low + share * span:.1f}</text>'
-    for colour, curve in zip(_COLOURS, plotted, strict=False):
+    for i, (colour, curve) in enumerate(zip(_COLOURS, plotted, strict=False)):
+        place = f'x="{_WIDTH - _MARGIN - 80 * i:g}" y="{top + 24:g}" fill="{colour}"'
+        yield f'<text {place} text-anchor="end">{escape(curve.policy)}</text>'
         ys = [bottom - (value - low) / span * height for value in curve.psnr_db]
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(xs, ys, strict=True))
-        line = f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2">'
-        yield f"{line}<title>{escape(curve.policy)}</title></polyline>"
+        yield f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2"/>'
