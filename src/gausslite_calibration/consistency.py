@@ -21,7 +21,7 @@ from gausslite.datasets.pose_track import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.pose import Trajectory
+from gausslite.domain.pose import Trajectory, inverse
 from gausslite.domain.recording import CameraCorrection
 from gausslite_calibration.corrected import CorrectedSource
 from gausslite_calibration.depth_consistency import DepthPair, best_factor, find_other_depth
@@ -200,6 +200,11 @@ def _best_rig(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair], er
     readings = [_Reading(words, axes @ motions @ axes.T) for words, axes in _axes()]
     nearest = readings[int(np.argmin(_errors(readings, pairs))) if error >= _DOUBTFUL else 0]
     mount = fit_mount(_point_motions(pairs, nearest.motions))
+    if mount is not None:
+        T = mount.T_body_camera
+        mounted = _Reading(mount.words, inverse(T) @ nearest.motions @ T)
+        if _errors([mounted], pairs)[0] > _RIGHT:  # six parameters halve the error of any poses
+            mount = None
     if mount is not None and mount.is_better_than(intrinsics):
         return f"{mount.words} with {nearest.words}," if mount.words and nearest.words else mount.words or None
     return None if intrinsics is None else intrinsics.words or None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -91,11 +91,12 @@ def _changed(camera: Camera, change: Change) -> Camera:
 class RigFit:
     """What fits far better than what is stated, in words, and the median distance that is left.
 
-    words: empty if the change is within the limits of right recordings.
+    words: empty if the change is within the limits of right recordings. T_body_camera: the mount, if it is what fits.
     """
 
     words: str
     distance: float
+    T_body_camera: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
     def is_better_than(self, intrinsics: RigFit | None) -> bool:
         """Return True for a mount that leaves less than other intrinsics do, clearly, as it has more parameters."""
@@ -137,7 +138,7 @@ def fit_mount(motions: Sequence[PointMotion]) -> RigFit | None:
         return None
     place = f"turned by {math.degrees(sizes[1]):.0f} degrees and {sizes[0]:.2f} m beside it"
     words = f"poses of another link than the camera, which is {place},"
-    return RigFit(words if (sizes > limits).any() else "", distance)
+    return RigFit(words if (sizes > limits).any() else "", distance, transform_of(change[_MOUNT]))
 
 
 def _multiplied(change: float) -> str:
