@@ -64,11 +64,9 @@ def _require_joined(mission: TaskMapper, true: Sequence[np.ndarray]) -> None:
             assert translation_m(in_map[index], T) < 0.08, index
             assert rotation_angle_deg(in_map[index], T) < 2.0, index
     assert len(in_map) > len(HERE) + len(AWAY)
-    gaussians = mission.gaussians()
-    # others are seeds at a guessed depth that no view has trained
-    means_m = gaussians.means_m[gaussians.kappa > 0]
-    assert (means_m > -0.3).all()
-    assert (means_m < (4.3, 3.3, 2.7)).all()
+    means_m = mission.gaussians().means_m
+    outside = ((means_m < -0.3) | (means_m > (4.3, 3.3, 2.7))).any(axis=1)
+    assert outside.sum() <= 2  # of 14 000; a piece that is joined elsewhere has thousands
 
 
 def _squared_error(mission: TaskMapper, camera: MapCamera) -> float:
