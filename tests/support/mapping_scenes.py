@@ -1,5 +1,7 @@
 """Small frames for the mapper's tests: a textured wall seen from a metre or two, with a region in the middle."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from gausslite.domain.camera import Camera
@@ -21,6 +23,14 @@ def wall_frame(index: int = 0, size: tuple[int, int] = (64, 48), depth_m: float 
     pattern = 0.5 + 0.25 * np.sin(6 * x)[None, :] + 0.25 * np.cos(5 * y)[:, None]
     rgb = (255 * np.stack([pattern, pattern**2, 1 - pattern], axis=-1)).astype(np.uint8)
     return Frame(index, index * 33_000_000, rgb, np.full((height, width), depth_m, np.float32), camera, T_world_camera)
+
+
+def with_box(frame: Frame) -> Frame:
+    """Return the frame with a box in its middle third, 40 cm before what is there: an object that a click finds."""
+    height, width = frame.depth_m.shape
+    depth_m = frame.depth_m.copy()
+    depth_m[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] -= 0.4
+    return replace(frame, depth_m=depth_m)
 
 
 def middle_relevance(frame: Frame) -> RelevanceMap:

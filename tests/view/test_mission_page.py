@@ -12,7 +12,7 @@ from urllib.request import urlopen
 
 import pytest
 from browser import open_browser, point
-from mapping_scenes import wall_frame
+from mapping_scenes import wall_frame, with_box
 from page_controls import control, text
 from tiny_sequences import write_seven_scenes
 
@@ -61,7 +61,7 @@ def mapped(view: MissionView, mapped_mission: ScheduledTaskMapper) -> Iterator[l
                 end = len(shares) + _SOME
             if len(shares) < end:
                 graph = mapped_mission.graph
-                outcome = mapped_mission.process(wall_frame(len(shares)))
+                outcome = mapped_mission.process(with_box(wall_frame(len(shares))))
                 shares.append(outcome.roi_share)
                 view.update(outcome)
                 # a request that came during the frame is answered by now
@@ -135,26 +135,26 @@ def test_what_a_person_points_at_is_meant_until_the_next_task() -> None:
     searched = mission((2, "Find the chair"))
     with pytest.raises(InvalidInputError, match="expected a mapped frame first"):
         searched.point_at([PointedObject(points_px=((32.0, 24.0),))])
-    assert searched.process(wall_frame()).roi_share == 0
+    assert searched.process(with_box(wall_frame())).roi_share == 0
     graph = searched.point_at([PointedObject(points_px=((32.0, 24.0),), noun="mug")])
     assert graph.targets == ("mug",)
-    assert searched.process(wall_frame(1)).roi_share > 0
-    assert searched.process(wall_frame(2)).roi_share == 0
+    assert searched.process(with_box(wall_frame(1))).roi_share > 0
+    assert searched.process(with_box(wall_frame(2))).roi_share == 0
     assert searched.graph is not None
     assert searched.graph.targets == ("chair",)
 
 
 def test_a_task_of_a_person_is_meant_until_the_next_scheduled_one() -> None:
     searched = mission((2, "Find the chair"))
-    searched.process(wall_frame())
+    searched.process(with_box(wall_frame()))
     searched.point_at([PointedObject(points_px=((32.0, 24.0),), noun="mug")])
     lamp = RuleParser().parse("Find the lamp")
     (warning,) = searched.assign(lamp).warnings
     assert "'lamp'" in warning
-    assert searched.process(wall_frame(1)).roi_share == 0
+    assert searched.process(with_box(wall_frame(1))).roi_share == 0
     assert searched.graph == lamp
     assert [(frame, graph.targets) for frame, graph in searched.schedule.switches] == [(2, ("chair",)), (1, ("lamp",))]
-    searched.process(wall_frame(2))
+    searched.process(with_box(wall_frame(2)))
     assert searched.graph.targets == ("chair",)
 
 
@@ -162,7 +162,7 @@ def test_a_keyframe_that_was_shown_can_be_pointed_at_when_newer_ones_have_replac
     searched, indices = mission(), range(80)
     shown = 0
     for index in indices:
-        searched.process(wall_frame(index))
+        searched.process(with_box(wall_frame(index)))
         if index == 3:
             view = searched.mapper.camera_view()
             assert view is not None
@@ -175,7 +175,7 @@ def test_a_keyframe_that_was_shown_can_be_pointed_at_when_newer_ones_have_replac
             [PointedObject(points_px=on_pixel, frame_index=next(i for i in indices if i not in {*kept, shown}))]
         )
     searched.point_at([PointedObject(points_px=on_pixel, frame_index=shown, noun="mug")])
-    assert searched.process(wall_frame(len(indices))).roi_share > 0
+    assert searched.process(with_box(wall_frame(len(indices)))).roi_share > 0
 
 
 def test_a_run_without_a_task_gets_none_later() -> None:

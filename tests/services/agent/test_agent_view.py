@@ -9,6 +9,7 @@ import pytest
 from agent_running import TASK, Agent, agent
 from browser import open_browser, point
 from fusion_running import frame
+from mapping_scenes import with_box
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.relevance import BallRegion
@@ -143,19 +144,19 @@ def test_a_click_on_the_map_is_a_target_until_it_is_left_out():
     ):
         running.client.assign_task("Find the chair")
         for index in range(4):
-            report = next(running.client.ingest([frame(index)]))
+            report = next(running.client.ingest([with_box(frame(index))]))
         tab = browser.new_page()
         tab.goto(url)
         tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
         point(tab, "Point in the map", "wall", (0.5, 0.5))
         tab.get_by_text("is a target").wait_for()
-        assert next(running.client.ingest([frame(4)])).roi_share > 0
+        assert next(running.client.ingest([with_box(frame(4))])).roi_share > 0
         (wall,) = running.worker.status().objects
         assert wall.noun == "wall"
         tab.locator(f"input[role=combobox][value='{wall.object_id} (1.00)']").wait_for()
         tab.get_by_role("button", name="Not this one").click()
         tab.get_by_text(f"{wall.object_id} is left out").wait_for()
-        assert next(running.client.ingest([frame(5)])).roi_share == 0
+        assert next(running.client.ingest([with_box(frame(5))])).roi_share == 0
 
 
 @pytest.mark.slow
@@ -167,7 +168,7 @@ def test_a_click_or_a_box_on_the_camera_image_is_a_target(places):
         live_page(0, running.client.address, is_agent=True) as url,
     ):
         running.client.assign_task("Find the chair")
-        report = next(running.client.ingest([frame(0)]))
+        report = next(running.client.ingest([with_box(frame(0))]))
         tab = browser.new_page()
         tab.goto(url)
         tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
@@ -177,7 +178,7 @@ def test_a_click_or_a_box_on_the_camera_image_is_a_target(places):
         tab.get_by_text("no object was chosen").wait_for()
         point(tab, "Point in the image", "wall", *places)
         tab.get_by_text("of frame 0 is a target").wait_for()
-        assert next(running.client.ingest([frame(1)])).roi_share > 0
+        assert next(running.client.ingest([with_box(frame(1))])).roi_share > 0
         (wall,) = running.worker.status().objects
         assert wall.noun == "wall"
 
