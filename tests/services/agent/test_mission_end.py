@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from agent_running import TASK, agent, agent_process, cup_options, end
 from fusion_running import RunningServer, frame, red_frame
+from mapping_scenes import with_box
 from uplink_running import uplink
 from waiting import wait_until
 
@@ -221,8 +222,8 @@ def test_an_agent_with_a_page_takes_a_task_without_a_detector(tmp_path: Path) ->
     pytest.importorskip("viser")
     with agent_process(tmp_path, "--set", "view=0") as (process, client):
         assert client.assign_task(TASK).warnings[0] == "nothing searches 'mug': there is no detector"
-        [answer] = client.ingest([red_frame(0)])
+        [answer] = client.ingest([with_box(red_frame(0))])
         client.assign_task(pointed=[PointedObject(points_px=((16.0, 12.0),), noun="mug")])
-        [pointed_at] = client.ingest([red_frame(1)])
+        [pointed_at] = client.ingest([with_box(red_frame(1))])
         end(process)
     assert (answer.roi_share, pointed_at.roi_share > 0) == (0, True)
