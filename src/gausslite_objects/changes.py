@@ -117,7 +117,7 @@ def with_earlier_objects(
     """Return the objects found, and the earlier ones that were neither found again nor seen to be gone or moved."""
     objects, ids = list(found), {landmark.object_id for landmark in found}
     left = {change.before_m for change in changes if change.kind is not ChangeKind.UNKNOWN}
-    for landmark in earlier:
+    for landmark in _joined(earlier):  # a part of what is gone, or was found, is no object of its own
         if landmark.centroid_m in left or any(_is_same_place(landmark, other) for other in found):
             continue
         object_id = landmark.object_id
