@@ -1,5 +1,7 @@
 """What changed between two maps: only what later views see through, or earlier ones saw empty."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from place_scenes import CAMERA, MapCamera
@@ -152,7 +154,9 @@ def test_the_rim_of_what_the_other_visit_does_not_see_is_no_change(share: float,
 
 
 def test_earlier_objects_come_along_unless_they_changed_or_were_found_again() -> None:
-    earlier = [_mug(HERE, 1), _mug(THERE, 2), _mug(OUTSIDE, 3)]
+    handle_m = (THERE[0] + 0.1, *THERE[1:])  # a part of the mug that is gone, as an object of its own
+    part = replace(_mug(handle_m, 4), extent_m=AxisAlignedBox.around(_grid(handle_m, 0.1)))
+    earlier = [_mug(HERE, 1), _mug(THERE, 2), _mug(OUTSIDE, 3), part]
     found = [_mug((6.05, 0.0, 2.0), 1)]
     changes = [Change(ChangeKind.GONE, "mug", (0.5, 0.5, 0.5), THERE)]
     objects = with_earlier_objects(found, earlier, changes)
