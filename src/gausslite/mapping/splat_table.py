@@ -179,9 +179,9 @@ class SplatTable:
         return chosen
 
     def make_isotropic(self) -> None:
-        """Set the three scales of each Gaussian to their geometric mean."""
-        log_scales = self.rows[:, LOG_SCALE]
-        log_scales[:] = log_scales.mean(axis=1, keepdims=True)
+        """Set the three scales of each Gaussian, and of its EMA, to their geometric mean."""
+        for log_scales in (self.rows[:, LOG_SCALE], self.ema_rows[:, LOG_SCALE]):
+            log_scales[:] = log_scales.mean(axis=1, keepdims=True)
 
     def clip_colours(self, lowest: float, highest: float) -> None:
         """Clip all colour channels to this range."""
@@ -255,21 +255,23 @@ class SplatTable:
             self._columns[name][: len(rows)] = column
         self.count = len(rows)
 
-    def update_ema(self, horizon_updates: float) -> None:
-        """Advance the EMA of all rows that changed since the last call.
+    def update_ema(self, horizon_updates: float, rows: UInt32[ndarray, " m"] | None = None) -> None:
+        """Advance the EMA of all rows, or of these, that changed since the last call.
 
         The horizon of a row is `horizon_updates`, but at most an eighth of its number of updates: an earlier value must
         not hold back a row that still moves far.
         """
-        changed = np.flatnonzero(self.rows[:, UPDATE_COUNT] != self.ema_rows[:, UPDATE_COUNT])
+        candidates = np.arange(self.count) if rows is None else rows
+        counts = (table[candidates, UPDATE_COUNT] for table in (self.rows, self.ema_rows))
+        changed = candidates[np.not_equal(*counts)]
         for start in range(0, len(changed), _ROWS_IN_CACHE):
             ids = changed[start : start + _ROWS_IN_CACHE]
-            rows, ema = self.rows.take(ids, axis=0), self.ema_rows.take(ids, axis=0)
+            now, ema = self.rows.take(ids, axis=0), self.ema_rows.take(ids, axis=0)
             # a row of n updates since the last call moves by 1 - exp(-n / horizon): calls may come at any interval
-            horizon = np.minimum(np.float32(horizon_updates), rows[:, UPDATE_COUNT] / _MIN_UPDATES_PER_HORIZON)
-            weight = -np.expm1((ema[:, UPDATE_COUNT] - rows[:, UPDATE_COUNT]) / horizon)
-            ema += weight[:, None] * (rows - ema)
-            ema[:, UPDATE_COUNT] = rows[:, UPDATE_COUNT]
+            horizon = np.minimum(np.float32(horizon_updates), now[:, UPDATE_COUNT] / _MIN_UPDATES_PER_HORIZON)
+            weight = -np.expm1((ema[:, UPDATE_COUNT] - now[:, UPDATE_COUNT]) / horizon)
+            ema += weight[:, None] * (now - ema)
+            ema[:, UPDATE_COUNT] = now[:, UPDATE_COUNT]
             self.ema_rows[ids] = ema
 
     def to_gaussians(self, ids: Int[ndarray, " m"] | None = None, use_ema: bool = False) -> Gaussians:

@@ -35,7 +35,6 @@ _MAX_VIEWS = 256
 """Views whose last loss is kept, those visited last."""
 _COLOUR_RANGE = (-0.25, 1.25)
 """Wider than [0, 1], so that blended colours still reach black and white."""
-_RANDOM_BLOCK = 16
 _HALF_SIZE_VIEWS = 4
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
@@ -219,8 +218,7 @@ class Trainer:
             views_of[Stage.ACTIVE] = [view for view in views if view.shows_roi]
         if self._settings.keyframes.rotates:
             return {stage: self._rotations[stage].turns(chosen) for stage, chosen in views_of.items() if chosen}
-        draws = _uniform_draws(self._rng)
-        return {stage: _drawn(chosen, draws) for stage, chosen in views_of.items() if chosen}
+        return {stage: _drawn(chosen, self._rng) for stage, chosen in views_of.items() if chosen}
 
     def _next_stage(self, done: int, roi_in_view: bool, scheduler: StageScheduler) -> Stage | None:
         """Return the stage of the next iteration, after `done` ones; None ends the frame."""
@@ -297,10 +295,12 @@ class Trainer:
         )
         if self._saturation.enabled:
             self._saturation.observe(view.keyframe.frame.id, report.loss)
+        # averaged over views: after a whole frame, views in turn often end with the same one, which would outweigh
+        self._update_ema(report.visible)
 
-    def _update_ema(self) -> None:
+    def _update_ema(self, rows: UInt32[ndarray, " m"] | None = None) -> None:
         if self._settings.optimization.ema_updates > 0:
-            self._table.update_ema(self._settings.optimization.ema_updates)
+            self._table.update_ema(self._settings.optimization.ema_updates, rows)
 
     def _prune_is_due(self, scheduler: StageScheduler) -> bool:
         return _is_due(self._since_prune, self._settings.density.prune_every, Stage.PRUNING, scheduler)
@@ -321,15 +321,10 @@ class Trainer:
             self._since_densify = 0
 
 
-def _uniform_draws(rng: np.random.Generator) -> Iterator[float]:
-    """Yield numbers in [0, 1), drawn in blocks: one generator call per iteration would cost measurable time."""
-    while True:
-        yield from rng.random(_RANDOM_BLOCK).tolist()
-
-
-def _drawn(views: Sequence[WindowView], draws: Iterator[float]) -> Iterator[WindowView]:
+def _drawn(views: Sequence[WindowView], rng: np.random.Generator) -> Iterator[WindowView]:
     """Yield uniformly drawn views without end."""
-    return (views[int(draw * len(views))] for draw in draws)
+    while True:
+        yield views[rng.integers(len(views))]
 
 
 def _is_due(iterations: int, interval: int, stage: Stage, scheduler: StageScheduler) -> bool:

@@ -293,9 +293,10 @@ class Rasterizer(Protocol):
     ) -> AbstractContextManager[None]:
         """Bind the tables to the backend for a sequence of steps inside this context.
 
-        Inside, pass the same arrays to `step`; no other code may read or change them. A device backend keeps copies and
-        writes the tables and update counters back on exit, also after an exception. Without a binding, each step
-        copies the tables to the device and back. Raises ShapeError, InvalidInputError if tables are bound already.
+        Inside, pass the same arrays to `step`; no other code may change them. A device backend keeps copies, so that
+        the arrays hold earlier values, and writes the tables and update counters back on exit, also after an exception.
+        Without a binding, each step copies the tables to the device and back.
+        Raises ShapeError, InvalidInputError if tables are bound already.
         """
 
 
