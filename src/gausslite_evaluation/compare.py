@@ -24,14 +24,14 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack
-from gausslite.domain.relevance import Region, largest_roi_per_segment
+from gausslite.domain.relevance import Region
 from gausslite.mission.evaluation import RenderFrame, TrainingFit
 from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 from gausslite_evaluation.lpips import Lpips
 from gausslite_evaluation.metrics import covered_share, depth_l1_m, gradient_deviation, laplacian_ratio, psnr, ssim_map
 from gausslite_evaluation.pictures import comparison_sheet
-from gausslite_evaluation.views import HeldOutView, largest_roi_views, render_fitted
+from gausslite_evaluation.views import HeldOutView, largest_roi_per_segment, largest_roi_views, render_fitted
 
 MAX_PSNR_DB = 100.0
 """Cap on a view's PSNR: equal images, such as a saturated region, would make the mean infinite."""
