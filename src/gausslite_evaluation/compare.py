@@ -196,7 +196,7 @@ class CorrectedScores:
 
 MAP_PURPOSES = {
     "concatenation": "all Gaussians of all robots: nothing is left out, and common places are there several times",
-    "vote": "each voxel from the robot that trained it most: the team's map, for all tasks at the size of one",
+    "vote": "each voxel from the robot that shows it best: the team's map, for all tasks at the size of one",
     "refine": "the voted map, trained further on all robots' keyframes after the mission: for views of the whole place",
 }
 TEAM_MAP = "vote"

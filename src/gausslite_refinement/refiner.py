@@ -15,10 +15,11 @@ from threading import Event
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine, WorkDone
 from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
+from gausslite.process import return_free_memory
 from gausslite.wire.views import ChangeNotifier
 from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.refinement import Refinement
-from gausslite_refinement.residual_vote import ResidualVote, spread_of
+from gausslite_refinement.residual_vote import ResidualVote, reduced, spread_of
 
 _log = logging.getLogger(__name__)
 _MAX_JUDGED = 300_000  # Gaussians of all maps, which are in memory while they are judged
@@ -34,10 +35,7 @@ class RefinementWorker:
         self._is_closed = Event()
 
     def judge(self, engine: FusionEngine) -> WorkDone:
-        """Let the maps win that leave the least error in the team's keyframes; it waits for a refinement that runs.
-
-        Without keyframes, kappa decides. More than _MAX_JUDGED Gaussians, and parts of a mission, are not judged.
-        """
+        """Let maps win by their error in the keyframes, if there are any; it waits for a refinement that runs."""
         return self._worker.submit(self._judge, engine).result()
 
     def _judge(self, engine: FusionEngine) -> WorkDone:
@@ -49,11 +47,13 @@ class RefinementWorker:
         names = spread_of(engine.keyframes.names())
         vote = ResidualVote({name: engine.maps.union_map(name) for name in sources if names and len(sources) > 1})
         if vote.is_contested:
-            keyframes = engine.in_fused_frame(engine.keyframes.decode(engine.keyframes.read(names)))
-            for _ in vote.steps(keyframes, self._create_rasterizer()):
+            one_by_one = (engine.keyframes.decode(engine.keyframes.read([name])) for name in names)
+            frames = [reduced(own.frame) for decoded in one_by_one for own in engine.in_fused_frame(decoded)]
+            for _ in vote.steps(frames, self._create_rasterizer()):
                 if self._is_closed.is_set():
                     return WorkDone(is_changed=False, is_due=True)
         engine.maps.prefer(vote.result())
+        return_free_memory()
         return WorkDone(engine.maps.revision() != revision, is_due=False)
 
     async def run(self, engine: FusionEngine, settings: RefineSettings) -> AsyncIterator[RefineProgress]:

@@ -17,7 +17,6 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.voxels import VoxelBatch, merge_batches, select_voxels
-from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.vote import PREFERRED, Preferred, fuse, source_hashes
 from gausslite.render.rasterizer import RGB, Rasterizer, gaussians_to_rows
 
@@ -50,12 +49,11 @@ class ResidualVote:
         """Return whether several maps have Gaussians in a voxel."""
         return len(self._ranked) > 0
 
-    def steps(self, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer) -> Iterator[None]:
-        """Judge one map after the other, once; it stops where its reader does. keyframes: in the frame of the maps."""
-        frames, voted = [_reduced(keyframe.frame) for keyframe in keyframes], self._voted.batch
+    def steps(self, frames: Sequence[Frame], rasterizer: Rasterizer) -> Iterator[None]:
+        """Judge one map after the other, once; it stops where its reader does. frames: keyframes in the fused frame."""
         for number in np.unique(self._ranked.agent_index).tolist():
             own, batch = np.flatnonzero(self._ranked.agent_index == number), self._maps[self._ranked.agents[number]]
-            shown = merge_batches(batch, select_voxels(voted, ~np.isin(voted.keys, batch.keys)))
+            shown = merge_batches(batch, select_voxels(self._voted.batch, ~np.isin(self._voted.batch.keys, batch.keys)))
             places = np.searchsorted(shown.keys, self._ranked.scores["keys"][own])
             weights, squared = _residuals(shown, frames, rasterizer)[:, places]
             self._errors[own] = np.where(weights >= _MIN_PIXELS, squared / np.maximum(weights, _MIN_PIXELS), np.inf)
@@ -83,11 +81,11 @@ def _residuals(shown: VoxelBatch, frames: Sequence[Frame], rasterizer: Rasterize
         d_rgb, none = np.zeros_like(rendering.rgb), np.zeros_like(rendering.depth_m)
         d_rgb[..., 0], d_rgb[..., 1] = 1.0, np.square(difference).mean(axis=2)
         sums += rasterizer.backward(rendering, d_rgb, none, none).d_rows[:, RGB].T[:2]
-    starts = np.cumsum(shown.counts, dtype=np.int64) - shown.counts
-    return np.add.reduceat(sums, starts, axis=1)
+    return np.add.reduceat(sums, np.cumsum(shown.counts, dtype=np.int64) - shown.counts, axis=1)
 
 
-def _reduced(frame: Frame) -> Frame:
+def reduced(frame: Frame) -> Frame:
+    """Return a small frame without depth."""
     camera = frame.camera.narrower(_WIDTH_PX)
     shape = camera.height_px, camera.width_px
     rgb = cv2.resize(frame.rgb, shape[::-1], interpolation=cv2.INTER_AREA)

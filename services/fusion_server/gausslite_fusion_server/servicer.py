@@ -43,7 +43,7 @@ _KEYFRAME_PAUSE = 2.0
 """Pause after a keyframe is stored, in the time that storing took."""
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
-_JUDGE_DELAY_S = 5.0
+_JUDGE_DELAY_S = 10.0
 _PAUSE = 4.0
 """Pause after background work, in its durations: it takes a fifth of a core at most."""
 _RETRY_S = 30.0
