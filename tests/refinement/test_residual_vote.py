@@ -81,8 +81,12 @@ def test_the_map_that_explains_the_keyframes_wins_from_their_arrival_on(worker: 
     assert not len(changes.removed)
     assert engine.maps.won_voxels("bad") == 0
     assert not worker.judge(engine).is_changed
-    # more kappa changes nothing until it is judged again
+    # more kappa of others changes nothing until it is judged again, less kappa of its own does
     contribute(engine, opposite(2, SHARED, 50))
+    assert winners(engine) == winners(started(store)) == {"good": keys(-1, 0, 1).tolist()}
+    contribute(engine, make_subset("good", 2, {**CELLS, 0: [1] * 4}))
+    assert winners(engine) == winners(started(store)) == by_kappa
+    assert worker.judge(engine).is_changed
     assert winners(engine) == winners(started(store)) == {"good": keys(-1, 0, 1).tolist()}
 
 

@@ -78,8 +78,8 @@ class VoteInput:
         if np.array_equal(before, preferred):
             return _NO_KEYS
         self._store.save_record(*_RECORD, preferred.tobytes())
-        self._preferred, pair = preferred, ["keys", "sources"]
-        return np.unique(np.setxor1d(before[pair], preferred[pair])["keys"])
+        self._preferred = preferred
+        return np.unique(np.setxor1d(before, preferred)["keys"])
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"]) -> VoxelBatch:
         """Return the updates of one agent on these voxels; empty in quarantine."""
