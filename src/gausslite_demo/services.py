@@ -368,11 +368,12 @@ def collect_maps(services: RunningServices, out: Path) -> dict[str, Path]:
     """Return the map files by name: the agents' own, and the fused ones exported by the server."""
     maps = {agent_id: out / agent_id / "map.ply" for agent_id in services.agents}
     with FusionClient(services.fusion_address, deadline_s=120.0) as client:
-        for strategy in ("concatenation", "vote"):
-            maps[strategy] = _save(out / f"{strategy}.ply", client.export(Export(strategy)))
+        strategies = {"concatenation": "concatenation", "vote": "vote"}
         if services.plan.refine_iterations > 0:
-            _refine(client, services.plan)
-            maps["refine"] = _save(out / "refine.ply", client.export(Export("refined")))
+            _refine(client, services.plan)  # first: it lets the keyframes judge the vote
+            strategies["refine"] = "refined"
+        for name, strategy in strategies.items():
+            maps[name] = _save(out / f"{name}.ply", client.export(Export(strategy)))
     return maps
 
 

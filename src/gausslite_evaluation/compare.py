@@ -24,14 +24,14 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack
-from gausslite.domain.relevance import Region, largest_roi_per_segment
+from gausslite.domain.relevance import Region
 from gausslite.mission.evaluation import RenderFrame, TrainingFit
 from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rasterizer, Rendering
 from gausslite_evaluation.lpips import Lpips
 from gausslite_evaluation.metrics import covered_share, depth_l1_m, gradient_deviation, laplacian_ratio, psnr, ssim_map
 from gausslite_evaluation.pictures import comparison_sheet
-from gausslite_evaluation.views import HeldOutView, largest_roi_views, render_fitted
+from gausslite_evaluation.views import HeldOutView, largest_roi_per_segment, largest_roi_views, render_fitted
 
 MAX_PSNR_DB = 100.0
 """Cap on a view's PSNR: equal images, such as a saturated region, would make the mean infinite."""
@@ -196,7 +196,7 @@ class CorrectedScores:
 
 MAP_PURPOSES = {
     "concatenation": "all Gaussians of all robots: nothing is left out, and common places are there several times",
-    "vote": "each voxel from the robot that trained it most: the team's map, for all tasks at the size of one",
+    "vote": "each voxel from the robot that shows it best: the team's map, for all tasks at the size of one",
     "refine": "the voted map, trained further on all robots' keyframes after the mission: for views of the whole place",
 }
 TEAM_MAP = "vote"

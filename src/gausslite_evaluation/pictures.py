@@ -10,9 +10,8 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.frame import Frame
-from gausslite.domain.relevance import largest_roi_per_segment
 from gausslite.mission.evaluation import RenderFrame
-from gausslite_evaluation.views import HeldOutView
+from gausslite_evaluation.views import HeldOutView, largest_roi_per_segment
 
 _HEADER_PX = 26
 _GAP_PX = 6

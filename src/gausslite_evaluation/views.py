@@ -17,7 +17,7 @@ from gausslite.domain.arrays import require_array
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
-from gausslite.domain.relevance import MIN_ROI_PIXELS, Region, largest_roi_per_segment
+from gausslite.domain.relevance import MIN_ROI_PIXELS, Region
 from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rendering
 from gausslite_poses.exposure import fit_exposure
@@ -46,6 +46,16 @@ class HeldOutView:
     def shows_region(self) -> bool:
         """True if the view shows at least MIN_ROI_PIXELS of the region."""
         return int(np.count_nonzero(self.roi)) >= MIN_ROI_PIXELS
+
+
+def largest_roi_per_segment(roi_pixels: Sequence[int], count: int) -> set[int]:
+    """Return the place of the largest region in each of `count` segments; of small ones only if all are small."""
+    if count < 1:
+        return set()
+    pixels = np.array(roi_pixels)
+    segments = [part for part in np.array_split(np.arange(len(pixels)), count) if len(part)]
+    best = {int(part[np.argmax(pixels[part])]) for part in segments}
+    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best
 
 
 def largest_roi_views(views: Sequence[HeldOutView], count: int) -> set[int]:

@@ -55,17 +55,17 @@ def run(options: argparse.Namespace) -> int:
     maps = {f"{i:03d} {path}": read_ply(path, print_message) for i, path in enumerate(files)}
     grid = VoxelGrid(options.voxel_size)
     fused = fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})
-    write_ply(options.out, fused.gaussians, world_frame)
+    write_ply(options.out, fused.batch.gaussians, world_frame)
     _print_unnamed(frames, world_frame)
     winners = fused.vote.winners
     won = np.bincount(winners.agent_index, minlength=len(winners.agents))
     voxels_won = {agent_id[4:]: int(won[winners.agents.index(agent_id)]) for agent_id in maps}
     if options.json:
-        report = {"gaussians": len(fused.gaussians), "voxels": len(fused.batch), "voxels_won": voxels_won}
+        report = {"gaussians": len(fused.batch.gaussians), "voxels": len(fused.batch), "voxels_won": voxels_won}
         print(as_text(report))
     else:
         wins = ", ".join(f"{name} won {count} voxels" for name, count in voxels_won.items())
-        print(f"{len(fused.gaussians):,} Gaussians → {options.out} ({wins})")
+        print(f"{len(fused.batch.gaussians):,} Gaussians → {options.out} ({wins})")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Run a joint refinement on its own thread, and report its progress.
+"""Run a joint refinement on its own thread, and report its progress; judge voxels by the agents' keyframes.
 
 `RefinementWorker` is the default plug-in of the group `gausslite.refiners`; the protocol is `Refiner` of the server.
 """
@@ -9,25 +9,52 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from threading import Event
 
 from gausslite.domain.errors import QuotaError
-from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.engine import FusionEngine, WorkDone
 from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
+from gausslite.process import return_free_memory
 from gausslite.wire.views import ChangeNotifier
 from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.refinement import Refinement
+from gausslite_refinement.residual_vote import ResidualVote, reduced, spread_of
 
 _log = logging.getLogger(__name__)
+_MAX_JUDGED = 300_000  # Gaussians of all maps, which are in memory while they are judged
 
 
 class RefinementWorker:
-    """Runs one refinement at a time. The rasterizer is created by the first refinement, since other calls need none."""
+    """Runs one refinement at a time. A rasterizer is created when one is needed, since other calls need none."""
 
     def __init__(self, create_rasterizer: CreateRasterizer) -> None:
-        self._create_rasterizer = create_rasterizer
+        self._create_rasterizer = cache(create_rasterizer)
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
+        self._is_closed = Event()
+
+    def judge(self, engine: FusionEngine) -> WorkDone:
+        """Let maps win by their error in the keyframes, if there are any; it waits for a refinement that runs."""
+        return self._worker.submit(self._judge, engine).result()
+
+    def _judge(self, engine: FusionEngine) -> WorkDone:
+        revision, sources = engine.maps.revision(), engine.store.agents()
+        if engine.has_background_work:
+            return WorkDone(is_changed=False, is_due=True)
+        if engine.store.is_shared or sum(engine.store.totals(name).gaussians for name in sources) > _MAX_JUDGED:
+            return WorkDone(is_changed=False, is_due=False)
+        names = spread_of(engine.keyframes.names())
+        vote = ResidualVote({name: engine.maps.union_map(name) for name in sources if names and len(sources) > 1})
+        if vote.is_contested:
+            one_by_one = (engine.keyframes.decode(engine.keyframes.read([name])) for name in names)
+            frames = [reduced(own.frame) for decoded in one_by_one for own in engine.in_fused_frame(decoded)]
+            for _ in vote.steps(frames, self._create_rasterizer()):
+                if self._is_closed.is_set():
+                    return WorkDone(is_changed=False, is_due=True)
+        engine.maps.prefer(vote.result())
+        return_free_memory()
+        return WorkDone(engine.maps.revision() != revision, is_due=False)
 
     async def run(self, engine: FusionEngine, settings: RefineSettings) -> AsyncIterator[RefineProgress]:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
@@ -46,6 +73,7 @@ class RefinementWorker:
             progress_notifier.notify()
 
         def work() -> None:
+            self._judge(engine)
             vote = RefineInput.of(engine)
             refinement = Refinement(vote, self._create_rasterizer(), settings)
             for line in refinement.left_out:
@@ -72,7 +100,8 @@ class RefinementWorker:
             cancelled.set()
 
     def close(self) -> None:
-        """Wait until the last refinement has ended after its cancellation."""
+        """Wait until the last refinement has ended after its cancellation; end a judgement."""
+        self._is_closed.set()
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def _finish(self, progress_notifier: ChangeNotifier) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -112,7 +112,7 @@ def require_own_camera(
 
 
 _SAME_CAMERA = 0.005
-"""Intrinsics that differ by a smaller share of the focal length, as by autofocus, count as equal."""
+"""Intrinsics that differ by a smaller share, as by autofocus, count as equal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +139,7 @@ class CameraPeriods:
 
 def same_camera(a: FolderCamera, b: FolderCamera) -> bool:
     """Return True for cameras of one size and lens with nearly equal intrinsics."""
-    return a.lens == b.lens and a.camera.is_close_to(b.camera, _SAME_CAMERA)
+    return a.lens == b.lens and np.allclose(astuple(a.camera), astuple(b.camera), rtol=_SAME_CAMERA)
 
 
 def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:

@@ -15,10 +15,10 @@ from gausslite.codec.state_file import write_png
 from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.relevance import largest_roi_per_segment
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
 from gausslite.mission.task_mapper import FrameOutcome
+from gausslite_evaluation.views import largest_roi_per_segment
 
 VIEWS, PHOTOGRAPH, ROI = "views", ".png", ".roi.png"
 

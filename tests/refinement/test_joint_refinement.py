@@ -141,8 +141,6 @@ def test_an_empty_or_too_large_map_is_refused() -> None:
         refine(Gaussians.empty(), [view(1)], ReferenceRasterizer(), QUICK)
     with pytest.raises(QuotaError, match="at most 3 Gaussians, got 16"):
         refine(patch(0.2), [view(1)], ReferenceRasterizer(), RefineSettings(max_gaussians=3))
-    for wrong in ({"check_every": 0}, {"max_gaussians": 0}):
-        pytest.raises(InvalidInputError, RefineSettings, **wrong).match("refine")
 
 
 def encoded(agent_id: str, index: int, data: bytes = b"", time_ns: int | None = None) -> EncodedKeyframe:
@@ -171,7 +169,6 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     assert {name: list(sizes) for name, sizes in store.keyframe_sizes().items()} == {"aardvark": [7]}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
         KeyframePool(store, Quotas(keyframe_pixels=1)).add(encoded("ant", 1))
-    pytest.raises(InvalidInputError, Quotas, keyframes_per_agent=0).match("expected at least 1")
 
 
 @pytest.mark.parametrize("restarts", [False, True])

@@ -114,6 +114,7 @@ def fusion_server(
             grpc.insecure_channel(running.address) as channel,
         ):
             yield RunningServer(servicer, client, pb_grpc.FusionServiceStub(channel), channel, loops[0])
+            loops[0].call_soon_threadsafe(servicer.drain)
     finally:
         servicer.close()
 

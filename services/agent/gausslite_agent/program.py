@@ -143,7 +143,9 @@ async def _serve(settings: AgentSettings) -> int:
     saved = _read_saved(settings)
     loop, changes = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
-        parser = _open_parser(settings, stack)
+        parser: TaskParser = DefaultParser()
+        if settings.link.parser is not None:
+            parser = stack.enter_context(ParserClient(settings.link.parser, tls=settings.tls))
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
         # a saved mission has its own
         folder = settings.prior if saved is None else None
@@ -247,12 +249,6 @@ async def _run_mission(
         first_parser.stop()
         await work
         await asyncio.to_thread(mission.finish)
-
-
-def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
-    if settings.link.parser is None:
-        return DefaultParser()
-    return stack.enter_context(ParserClient(settings.link.parser, tls=settings.tls))
 
 
 def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bool) -> Uplink | None:

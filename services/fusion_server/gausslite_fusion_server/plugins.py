@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
-from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.engine import FusionEngine, WorkDone
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -63,7 +63,7 @@ OpenRenderer = Callable[[FusedMapLayers, CreateRasterizer], MapRenderer]
 
 
 class Refiner(Protocol):
-    """Refines a server's fused map, one refinement at a time."""
+    """Refines a server's fused map, one refinement at a time, and judges who wins its voxels."""
 
     def run(self, engine: FusionEngine, settings: RefineSettings) -> AsyncIterator[RefineProgress]:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
@@ -72,8 +72,11 @@ class Refiner(Protocol):
         agrees with the map.
         """
 
+    def judge(self, engine: FusionEngine) -> WorkDone:
+        """Let the maps win that fit the agents' keyframes best, without a lock. Call it from one thread at a time."""
+
     def close(self) -> None:
-        """Wait until the last refinement has ended after its cancellation."""
+        """Wait until the last refinement has ended after its cancellation; end a judgement."""
 
 
 OpenRefiner = Callable[[CreateRasterizer], Refiner]

@@ -109,6 +109,7 @@ def _page(settings: ServerSettings) -> AbstractContextManager[None]:
 
 async def _serve_mission(settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer) -> None:
     async def work_until_stopped() -> None:
+        servicer.publish_changes()
         try:
             await asyncio.Event().wait()
         finally:

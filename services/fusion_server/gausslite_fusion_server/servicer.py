@@ -18,7 +18,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.engine import FusionEngine, WorkDone
 from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.refinement import CreateRasterizer, RefineSettings
-from gausslite.plugins import Group, load
+from gausslite.plugins import Group, find, load
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1 import geometry_pb2
@@ -43,6 +43,7 @@ _KEYFRAME_PAUSE = 2.0
 """Pause after a keyframe is stored, in the time that storing took."""
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
+_JUDGE_DELAY_S = 10.0
 _PAUSE = 4.0
 """Pause after background work, in its durations: it takes a fifth of a core at most."""
 _RETRY_S = 30.0
@@ -144,7 +145,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def __init__(self, engine: FusionEngine, refine: RefineSettings, create_rasterizer: CreateRasterizer) -> None:
         self.engine = engine
         self._refine, self._create_rasterizer = refine, create_rasterizer
-        self._refiner: Refiner | None = None
+        create: OpenRefiner | None = find(Group.REFINERS)
+        self._refiner: Refiner | None = None if create is None else create(create_rasterizer)
         self._renderer: MapRenderer | None = None
         self._workers = WorkerPool("fusion server", _WORKERS, _MAX_WAITING)
         # one thread: messages that arrive during a commit wait for the next one and share it
@@ -155,8 +157,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._views = WorkerPool("views", waiting=MAX_VIEWS_WAITING)
         self._map_changes = ChangeNotifier()
         align, notify = functools.partial(engine.align_due, 1), self._map_changes.notify
-        self._aligning = BackgroundWork(align, notify, "frames are not compared", _ALIGN_DELAY_S)
-        self._slices = BackgroundWork(engine.work_in_background, notify, "maps are not moved or deleted", 0.0)
+        self._judging = BackgroundWork(self._judge, notify, "voxels are not judged by keyframes", _JUDGE_DELAY_S)
+        self._aligning = BackgroundWork(align, self._publish, "frames are not compared", _ALIGN_DELAY_S)
+        self._slices = BackgroundWork(engine.work_in_background, self._publish, "maps are not moved or deleted", 0.0)
         self._gate = DrainGate()
         self._rejections = RejectionLog(_log)
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
@@ -177,8 +180,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def drain(self) -> None:
         """End every open stream and every later call with UNAVAILABLE."""
         self._gate.close()
-        self._aligning.cancel()
-        self._slices.cancel()
+        for work in (self._aligning, self._slices, self._judging):
+            work.cancel()
         self._map_changes.notify()
 
     async def store_message(self, session: SessionRecord, message: bytes | EncodedSubset) -> StoredCount:
@@ -193,12 +196,19 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self.publish_changes()
 
     def publish_changes(self) -> None:
-        """Wake the watchers, and look which frames are due. Use it on the event loop."""
-        self._map_changes.notify()
+        """Wake the watchers, and look which frames and voxels are due. Use it on the event loop."""
+        self._publish()
         if self.engine.frames.are_compared:
             self._aligning.wake()
         if self.engine.has_background_work:
             self._slices.wake()
+
+    def _publish(self) -> None:
+        self._map_changes.notify()
+        self._judging.wake()
+
+    def _judge(self) -> WorkDone:
+        return WorkDone(False, False) if self._refiner is None else self._refiner.judge(self.engine)
 
     def _commit_soon(self) -> None:
         """Commit what is queued in the commit thread; one call serves all messages queued before it begins."""
@@ -213,11 +223,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def close(self) -> None:
         """Wait until the work in threads has ended."""
         pools = self._views, self._exports, self._queries, self._joins, self._keyframes, self._workers
-        for part in (self._aligning, self._slices, *pools):
+        refiner = () if self._refiner is None else (self._refiner,)
+        for part in (*refiner, self._aligning, self._slices, self._judging, *pools):
             part.close()
         self._committer.shutdown(wait=True)
-        if self._refiner is not None:
-            self._refiner.close()
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Join the mission."""
@@ -291,6 +300,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                     raise
                 response.rejected.add(index=request.keyframe.index, reason=str(error))
         self._aligning.wake()  # they may show where an unknown frame is
+        self._judging.wake()
         return response
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
@@ -325,11 +335,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._gate.require_open()
         self.engine.members.require_mission(request.mission_id)
         settings = messages.refine_settings(self._refine, request)
-        if self._refiner is None:
-            create: OpenRefiner = load(Group.REFINERS, purpose="refinement")
-            self._refiner = create(self._create_rasterizer)
+        refiner: Refiner = self._refiner or load(Group.REFINERS, purpose="refinement")
         response = pb.RefineFusedMapResponse()
-        async for progress in self._refiner.run(self.engine, settings):
+        async for progress in refiner.run(self.engine, settings):
             self._gate.require_open()
             response = pb.RefineFusedMapResponse(**asdict(progress))
             yield response

@@ -77,13 +77,6 @@ class Camera:
         fx_px, fy_px, cx_px, cy_px = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return replace(self, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
 
-    def is_close_to(self, other: Camera, tolerance: float) -> bool:
-        """True for a camera of the same size whose intrinsics differ by at most this share of the focal length."""
-        if (self.width_px, self.height_px) != (other.width_px, other.height_px):
-            return False
-        names = ("fx_px", "fy_px", "cx_px", "cy_px")
-        return all(abs(getattr(self, name) - getattr(other, name)) <= tolerance * self.fx_px for name in names)
-
     def resized(self, width_px: int, height_px: int) -> Camera:
         """Return the camera for an image scaled to this size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px

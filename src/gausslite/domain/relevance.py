@@ -268,13 +268,3 @@ class RelevanceMap:
     def roi_share(self) -> float:
         """Fraction of pixels in the task's region."""
         return float(np.count_nonzero(self.pixel_weights) / self.pixel_weights.size)
-
-
-def largest_roi_per_segment(roi_pixels: Sequence[int], count: int) -> set[int]:
-    """Return the place of the largest region in each of `count` segments; of small ones only if all are small."""
-    if count < 1:
-        return set()
-    pixels = np.array(roi_pixels)
-    segments = [part for part in np.array_split(np.arange(len(pixels)), count) if len(part)]
-    best = {int(part[np.argmax(pixels[part])]) for part in segments}
-    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best

@@ -35,8 +35,8 @@ from gausslite.domain.voxels import (
 from gausslite.fusion.change_log import ChangeLog, VoxelLog
 from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.vote import VoteResult, rank_voxels, union_maps
-from gausslite.fusion.vote_input import VoteInput
+from gausslite.fusion.vote import Preferred, VoteResult, union_maps
+from gausslite.fusion.vote_input import SLICE_VOXELS, VoteInput
 
 # no agent can have an empty id
 REFINEMENT = "", "refined-map"
@@ -174,7 +174,7 @@ class FusedMapLayers:
         self._votes, self._grid = votes, grid
         self._change_log = ChangeLog(first_revision, max_removed_voxels)
         self._refined: RefinedMap | None = None
-        vote = rank_voxels(votes.scores())
+        vote = votes.rank()
         self._change_log.load(vote)
         # until the first refinement, the refined layer is the vote
         self._voted_log = self._refined_log = self._change_log.voxels
@@ -218,6 +218,14 @@ class FusedMapLayers:
             self._record(changed)
         return failed
 
+    def prefer(self, preferred: Preferred) -> None:
+        """Let these maps win their voxels from now on, slice by slice, also after a restart. Raises StorageError."""
+        with self._lock:
+            keys = self._votes.prefer(preferred)
+        for start in range(0, len(keys), SLICE_VOXELS):
+            with self._lock:
+                self._record(dict.fromkeys(self._votes.agents(), keys[start : start + SLICE_VOXELS]))
+
     def set_frame(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Read the agent's updates in this frame from now on; `update` moves what is stored."""
         with self._lock:
@@ -254,7 +262,7 @@ class FusedMapLayers:
         if not changed_keys:
             return
         # the vote is a pure function of the store: on these voxels it is what a vote on all would give
-        vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
+        vote = self._votes.rank(np.concatenate(list(changed_keys.values())))
         fused_changes = self._change_log.record(changed_keys, vote)
         if self._refined_log is not self._voted_log:
             is_present = np.isin(fused_changes, vote.keys)
@@ -289,12 +297,16 @@ class FusedMapLayers:
         return batch, {name: np.intersect1d(np.array(own, np.int64), of_targets) for name, own in won_keys.items()}
 
     def union_map(self, only_agent: str = "") -> VoxelBatch:
-        """Return all agents' Gaussians, or one agent's."""
-        batches = self._votes.batches()
+        """Return all agents' Gaussians, or one agent's, tile after tile."""
         if only_agent:
             self._require_contributor(only_agent)
-            batches = {only_agent: batches[only_agent]}
-        return union_maps(batches)
+        parts = []
+        for tile in self.tiles(MapLayer.VOTE)[1].tolist():
+            with self._lock:
+                keys = self._voted_log.keys(tile)
+                one = {only_agent: self._votes.batch(only_agent, keys)} if only_agent else None
+                parts.append(union_maps(one or self._votes.batches(keys)))
+        return merge_batches(*parts)
 
     def show_refined(self, gaussians: Gaussians, revision: int, sources: tuple[str, ...]) -> StoredRefinement:
         """Show the result of a refinement that started from the vote at this revision, one tile after the other.
@@ -319,7 +331,7 @@ class FusedMapLayers:
                 changed.update(revisions.changed_since(seen).tolist())
                 seen = revisions.revision
                 self._show_tile(tile, own.get(tile, set()), changed)
-                vote = rank_voxels(self._votes.scores(self._voted_log.keys(tile)))
+                vote = self._votes.rank(self._voted_log.keys(tile))
             keys.append(vote.keys)
             hashes.append(_winner_hashes(vote))
         voted = np.concatenate(keys)

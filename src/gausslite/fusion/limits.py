@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gausslite.config.option import option
 from gausslite.config.values import VOXEL_SIZE
 from gausslite.domain.checks import quote_name, require_identifier, require_name
-from gausslite.domain.errors import InvalidInputError, MismatchError, QuotaError
+from gausslite.domain.errors import MismatchError, QuotaError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.change_log import MAX_REMOVED_VOXELS
 
@@ -85,11 +85,6 @@ class Quotas:
     keyframe_bytes_per_agent: int = 64 << 20
     kappa_at_join: int = 120_000  # highest kappa of one Gaussian at the agent's first join
     kappa_per_second: int = 2000  # its growth since then; 32 iterations for each frame at 30 Hz are 1 500
-
-    def __post_init__(self) -> None:
-        for quota in fields(self):
-            if getattr(self, quota.name) < 1:
-                raise InvalidInputError(f"quota {quota.name}: expected at least 1, got {getattr(self, quota.name)}")
 
     def require_keyframe(self, index: int, pixels: int, size_bytes: int) -> None:
         """Raise QuotaError if one keyframe exceeds the limits; needs no decoded image."""

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gausslite.config.option import option
-from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.render.rasterizer import Rasterizer
 
@@ -33,11 +32,6 @@ class RefineSettings:
     report_every: int = 10
     check_every: int = 50
     max_prepared_views: int = 96  # views in memory at a time
-
-    def __post_init__(self) -> None:
-        for name in ("max_gaussians", "report_every", "check_every", "max_prepared_views"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"refine {name}: expected at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,16 +6,24 @@ and voxels can be fused in shards whose union is the whole map.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int64, UInt32
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, gather_rows
 from gausslite.fusion.score_index import SCORES, VoxelScoreTable
+
+PREFERRED = np.dtype([("keys", "<i8"), ("sources", "<u4"), ("kappa_sums", "<u8")])
+Preferred = NDArray[Any]
+"""Voxels, keys ascending, that a map wins as long as it has at least this Σkappa there, and the hash of its name."""
+_NO_PREFERRED = np.zeros(0, PREFERRED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,22 +52,27 @@ class VoteResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedMap:
-    """The winner's Gaussians on every voxel that has any, and the result of the vote."""
+    """The winner's Gaussians on every voxel that has any, sorted by voxel, and the result of the vote."""
 
     batch: VoxelBatch
     vote: VoteResult
 
-    @property
-    def gaussians(self) -> Gaussians:
-        """The fused map, sorted by voxel."""
-        return self.batch.gaussians
+
+def source_hashes(names: Sequence[str]) -> UInt32[ndarray, " n"]:
+    """Return a hash of each map's name."""
+    return np.array([zlib.crc32(name.encode()) for name in names], np.uint32)
 
 
-def rank_voxels(table: VoxelScoreTable) -> VoteResult:
-    """Rank the agents on each voxel by (higher Σkappa, more Gaussians, lower agent id)."""
+def rank_voxels(table: VoxelScoreTable, preferred: Preferred = _NO_PREFERRED) -> VoteResult:
+    """Rank the agents on each voxel by (preferred, higher Σkappa, more Gaussians, lower agent id)."""
     keys, kappa_sums, counts = (table.scores[name] for name in ("keys", "kappa_sums", "counts"))
+    is_preferred = np.zeros(len(keys), np.bool_)
+    if len(preferred):
+        own = preferred.take(np.searchsorted(preferred["keys"], keys), mode="clip")
+        is_own = own["sources"] == source_hashes(table.agents)[table.agent_index]
+        is_preferred = is_own & (own["keys"] == keys) & (own["kappa_sums"] <= kappa_sums)
     # the bitwise complement of an unsigned number sorts it in descending order
-    order = np.lexsort((table.agent_index, ~counts, ~kappa_sums, keys))  # Σκ, then the denser source, then the first id
+    order = np.lexsort((table.agent_index, ~counts, ~kappa_sums, ~is_preferred, keys))
     ranked = table.take(order[counts[order] > 0])  # a tombstone wins nothing
     starts = np.unique(ranked.scores["keys"], return_index=True)[1]
     return VoteResult(ranked, np.append(starts, len(ranked)).astype(np.int64))

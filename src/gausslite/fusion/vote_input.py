@@ -1,4 +1,4 @@
-"""The voxel updates as the vote reads them: in the fused frame, without quarantined agents."""
+"""The voxel updates as the vote reads them: in the fused frame, without quarantined agents; and who is preferred."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
 
+from gausslite.domain.errors import CodecError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.moved_voxels import PAIRS, MovedVoxels, Pairs
 from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 from gausslite.fusion.store import FusionStore
+from gausslite.fusion.vote import PREFERRED, Preferred, VoteResult, rank_voxels, source_hashes
 
 SLICE_VOXELS = 128
 MOVED_BYTES = 260
 """What a voxel takes beside its own bytes while it is used in another frame; measured."""
+_RECORD = "", "preferred"
+"""Owner and name of the stored preferences."""
 _NO_KEYS = np.zeros(0, np.int64)
 
 
@@ -29,8 +33,12 @@ class VoteInput:
     """
 
     def __init__(self, store: FusionStore, frames: Mapping[str, FrameAlignment], grid: VoxelGrid) -> None:
-        """frames: of the agents, as far as they have one."""
+        """frames: of the agents, as far as they have one. Raises CodecError, StorageError."""
         self._store, self._grid = store, grid
+        data = b"" if store.is_shared else store.find_record(*_RECORD)
+        if len(data) % PREFERRED.itemsize:
+            raise CodecError(f"stored preferences: expected rows of {PREFERRED.itemsize} bytes, got {len(data)} bytes")
+        self._preferred: Preferred = np.frombuffer(data, PREFERRED)
         # of the agents whose updates are not used as sent
         self._frames: dict[str, FrameAlignment] = {}
         self._moved: dict[str, MovedVoxels] = {}
@@ -60,18 +68,28 @@ class VoteInput:
                 table = self._with_moved(table, index, self._moved[agent_id], keys)
         return table
 
-    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
-        """Return the updates of one agent on these voxels, or on all; empty in quarantine."""
+    def rank(self, keys: Int64[ndarray, " k"] | None = None) -> VoteResult:
+        """Return the vote on these voxels, or on all."""
+        return rank_voxels(self.scores(keys), self._preferred)
+
+    def prefer(self, preferred: Preferred) -> Int64[ndarray, " k"]:
+        """Let these maps win their voxels, also after a restart; returns the voxels that may change. StorageError."""
+        before = self._preferred
+        if np.array_equal(before, preferred):
+            return _NO_KEYS
+        self._store.save_record(*_RECORD, preferred.tobytes())
+        self._preferred = preferred
+        return np.unique(np.setxor1d(before, preferred)["keys"])
+
+    def batch(self, agent_id: str, keys: Int64[ndarray, " k"]) -> VoxelBatch:
+        """Return the updates of one agent on these voxels; empty in quarantine."""
         moved = self._moved.get(agent_id)
         if moved is None:
             return self._store.batch(agent_id, keys)
-        if keys is None:
-            as_sent = self._store.batch(agent_id)
-            as_sent = select_voxels(as_sent, ~moved.has(as_sent.keys))
-        else:
-            as_sent = self._store.batch(agent_id, np.unique(keys[~moved.has(keys)]))
-        pairs = moved.pairs(keys)
-        found = select_keys(self._move(agent_id, np.unique(pairs["sources"])), np.unique(pairs["cells"]))
+        as_sent, pairs = self._store.batch(agent_id, np.unique(keys[~moved.has(keys)])), moved.pairs(keys)
+        sources = self._gaussians_in_frame(agent_id, self._store.batch(agent_id, np.unique(pairs["sources"])))
+        in_range = sources.take(np.flatnonzero(self._in_range(sources)))
+        found = select_keys(group_by_voxel(in_range, self._grid), np.unique(pairs["cells"]))
         both = np.isin(as_sent.keys, found.keys)
         if not both.any():
             return merge_batches(as_sent, found)
@@ -81,8 +99,8 @@ class VoteInput:
         shared = group_by_voxel(Gaussians.concatenate([mixed, select_voxels(found, ~others).gaussians]), self._grid)
         return merge_batches(select_voxels(as_sent, ~both), select_voxels(found, others), shared)
 
-    def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
-        """Return the updates of every agent on these voxels, or on all."""
+    def batches(self, keys: Int64[ndarray, " k"]) -> dict[str, VoxelBatch]:
+        """Return the updates of every agent on these voxels."""
         batches = self._store.batches(keys)
         return {name: self.batch(name, keys) if name in self._moved else batch for name, batch in batches.items()}
 
@@ -123,6 +141,9 @@ class VoteInput:
             self._frames[former] = self._frames.pop(agent_id)
         if agent_id in self._moved:
             self._moved[former] = self._moved.pop(agent_id)
+        renamed, (name, other) = self._preferred.copy(), source_hashes([agent_id, former])
+        renamed["sources"][renamed["sources"] == name] = other
+        self.prefer(renamed)
         if former not in self.agents():
             self.remove_agent(former)
         return former
@@ -132,10 +153,6 @@ class VoteInput:
         self._frames.pop(agent_id, None)
         moved = self._moved.pop(agent_id, None)
         return _NO_KEYS if moved is None else np.unique(moved.pairs(None)["cells"])
-
-    def _move(self, agent_id: str, sources: Int64[ndarray, " s"]) -> VoxelBatch:
-        gaussians = self._gaussians_in_frame(agent_id, self._store.batch(agent_id, sources))
-        return group_by_voxel(gaussians.take(np.flatnonzero(self._in_range(gaussians))), self._grid)
 
     def _gaussians_in_frame(self, agent_id: str, batch: VoxelBatch) -> Gaussians:
         """Return the Gaussians in the fused frame, in their order."""

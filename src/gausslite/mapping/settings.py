@@ -180,12 +180,9 @@ class SaturationSettings:
     saturated: float = 0.04  # from this one downwards, max_released
 
     def __post_init__(self) -> None:
-        if not 0 <= self.max_released <= 1:
-            raise InvalidInputError(f"saturation max_released: expected 0 to 1, got {self.max_released}")
-        if not -math.inf < self.saturated < self.improving < math.inf:
-            raise InvalidInputError(
-                f"saturation saturated: expected less than improving ({self.improving}), got {self.saturated}"
-            )
+        _require(0 <= self.max_released <= 1, "saturation max_released", "0 to 1", self.max_released)
+        is_less = -math.inf < self.saturated < self.improving < math.inf
+        _require(is_less, "saturation saturated", f"less than improving ({self.improving})", self.saturated)
 
 
 @dataclass(frozen=True, slots=True)

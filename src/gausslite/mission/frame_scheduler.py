@@ -54,14 +54,6 @@ class SchedulerSettings:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.seconds_per_frame) and self.seconds_per_frame > 0):
             raise InvalidInputError(f"seconds_per_frame: expected a positive number, got {self.seconds_per_frame}")
-        if self.min_iterations < 0:
-            raise InvalidInputError(f"min_iterations: expected at least 0, got {self.min_iterations}")
-        if len(set(self.skip_stages)) != len(self.skip_stages):
-            raise InvalidInputError(f"skip_stages: expected each once, got {', '.join(self.skip_stages)}")
-        if not 0 <= self.deadline_slack <= 1:
-            raise InvalidInputError(
-                f"deadline_slack: expected a share of a frame's time, 0 to 1, got {self.deadline_slack}"
-            )
 
     @property
     def deadline_slack_s(self) -> float:

@@ -325,7 +325,8 @@ def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"
         require_array("subset tiles", subset.tiles, grid, np.bool_)
     if subset.ids is not None:
         require_array("subset ids", subset.ids, (None,), np.uint32)
-        _require_ascending(subset.ids, n)
+        if len(subset.ids) and (subset.ids[-1] >= n or (subset.ids[1:] <= subset.ids[:-1]).any()):
+            raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
 
 
 def require_row_masks(n: int, trainable: Bool[ndarray, " n"] | None, update_counter: UpdateCounter | None) -> None:
@@ -370,11 +371,6 @@ def require_view(
             raise InvalidInputError(
                 f"view pixel_weights: expected values in [0, 1], got {pixel_weights.min()} to {pixel_weights.max()}"
             )
-
-
-def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:
-    if len(ids) and (ids[-1] >= n or (ids[1:] <= ids[:-1]).any()):
-        raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
 
 
 def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:

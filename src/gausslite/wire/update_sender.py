@@ -71,14 +71,6 @@ class UplinkSettings:
         """What the agent says of its frame when it joins, see `FusionClient.join`."""
         return UNKNOWN if self.frame == UNKNOWN else self.T_fused_agent
 
-    def __post_init__(self) -> None:
-        if self.kbps is not None and not self.kbps > 0:
-            raise InvalidInputError(f"uplink kbps: expected a positive number, got {self.kbps}")
-        if not (self.interval_s >= 0 and self.resend_threshold >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
-            raise InvalidInputError(
-                "uplink: expected an interval and resend threshold of at least 0, and a positive deadline and size"
-            )
-
 
 @dataclass(frozen=True, slots=True)
 class UplinkCounters:

@@ -182,7 +182,7 @@ class _ChaosRun:
             "lost": sum(comparison.lost for comparison in self.comparisons),
             "wrong": sum(comparison.wrong for comparison in self.comparisons),
             "extra_at_end": last.extra,
-            "same_map": exported == ply_bytes(offline.gaussians),
+            "same_map": exported == ply_bytes(offline.batch.gaussians),
             "server_errors": self.server.unexpected_errors,
             "time_s": time.monotonic() - begin_s,
             "rss_mib_at_end": rss_mib,

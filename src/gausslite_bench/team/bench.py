@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -10,18 +11,21 @@ import numpy as np
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_voxels
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.map_viewer import MapViewer
+from gausslite.wire.convert import decode_frame, frame_to_message
 from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
 from gausslite_evaluation.compare import MapScores, score_team
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_refinement.refine_input import RefineInput
 from gausslite_refinement.refinement import Refinement
+from gausslite_refinement.refiner import RefinementWorker
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
 _GRID = VoxelGrid()
@@ -95,22 +99,34 @@ def run_trial(trial: TeamTrial, scene: TeamScene) -> TeamResult:
 
 def _fuse(trial: TeamTrial, maps: Sequence[AgentMap]) -> tuple[dict[str, Gaussians], FusionEngine]:
     """Return the fused map of each strategy, and the engine that has received the whole maps."""
+    worker = RefinementWorker(functools.partial(choose_rasterizer, threads=trial.settings.threads))
     engine = _fuse_messages({agent_map.agent_id: _whole_map(agent_map) for agent_map in maps})
+    _judge(engine, maps, worker)
     fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
     first, *others = maps
     shared = {first.agent_id: _whole_map(first), **{other.agent_id: other.messages for other in others}}
-    fused[SHARED_VOTE] = _fuse_messages(shared).maps.voted_map().gaussians
+    of_shared = _fuse_messages(shared)
+    _judge(of_shared, maps, worker)
+    worker.close()
+    fused[SHARED_VOTE] = of_shared.maps.voted_map().gaussians
     if trial.refine_iterations > 0:
-        keyframes = engine.in_fused_frame([keyframe for agent_map in maps for keyframe in agent_map.keyframes])
         settings = RefineSettings(iterations=trial.refine_iterations, seed=trial.settings.seed)
         rasterizer = choose_rasterizer(threads=trial.settings.threads)
-        voted, regions = engine.maps.voted_regions()
-        vote = RefineInput(voted.gaussians, keyframes, regions, _GRID, engine.maps.revision())
-        refinement = Refinement(vote, rasterizer, settings)
+        refinement = Refinement(RefineInput.of(engine), rasterizer, settings)
         for _ in refinement.steps():
             pass
         fused[REFINED] = refinement.result()
     return fused, engine
+
+
+def _judge(engine: FusionEngine, maps: Sequence[AgentMap], worker: RefinementWorker) -> None:
+    """Store the agents' keyframes as they are sent, and let them judge the vote."""
+    for keyframe in (keyframe for agent_map in maps for keyframe in agent_map.keyframes):
+        frame = keyframe.frame
+        data = frame_to_message(frame, compact=True).SerializeToString()
+        pixels = frame.depth_m.size
+        engine.keyframes.add(EncodedKeyframe(keyframe.agent_id, frame.index, frame.capture_time_ns, pixels, data))
+    worker.judge(engine)
 
 
 def _whole_map(agent_map: AgentMap) -> tuple[RoiSubset, ...]:
@@ -125,7 +141,7 @@ def _whole_map(agent_map: AgentMap) -> tuple[RoiSubset, ...]:
 def _fuse_messages(messages: Mapping[str, Sequence[RoiSubset]]) -> FusionEngine:
     """Return a fusion engine that has received each agent's messages, agent by agent."""
     quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
-    engine = FusionEngine(SqliteStore(), FusionSettings(_GRID, quotas=quotas), aligner=MapAligner(_GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(_GRID, quotas=quotas), None, decode_frame, MapAligner(_GRID))
     for agent_id, subsets in messages.items():
         session_id = engine.join(agent_id, MissionConfig("", "", _GRID.size_m)).session.session_id
         for subset in subsets:

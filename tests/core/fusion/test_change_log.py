@@ -67,7 +67,7 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
 def assert_status_is_counted_from_the_map(engine: FusionEngine, fused: FusedMap) -> None:
     status = engine.status()
     winners = [best[0] for best, *_ in votes_of(fused.vote).values()]
-    assert (status.fused_voxels, status.fused_gaussians) == (len(fused.batch), len(fused.gaussians))
+    assert (status.fused_voxels, status.fused_gaussians) == (len(fused.batch), len(fused.batch.gaussians))
     for agent in status.agents:
         assert agent.won_voxels == winners.count(agent.agent_id)
 

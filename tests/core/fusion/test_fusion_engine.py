@@ -11,7 +11,6 @@ from sample_gaussians import plain_gaussians
 from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import (
     GaussLiteError,
-    InvalidInputError,
     MismatchError,
     QuotaError,
     SessionUnknownError,
@@ -104,8 +103,6 @@ def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
     with pytest.raises(QuotaError, match="at most 2 voxels in all, got 3"):
         engine.contribute(ant, make_subset("ant", 3, [], removed=(2,)), GRID)
     assert engine.status().agents[0].gaussians == 1
-    for wrong in ({"agents": 0}, {"keyframe_pixels": -1}):
-        pytest.raises(InvalidInputError, Quotas, **wrong).match("quota")
 
 
 def test_every_error_message_is_one_short_line() -> None:

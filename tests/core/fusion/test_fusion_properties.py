@@ -180,7 +180,7 @@ def test_the_scores_of_a_voxel_descend_and_its_winner_has_gaussians(specs: dict[
     table = table_from(specs)
     fused = fuse(table)
     votes = votes_of(fused.vote)
-    assert len(fused.gaussians) == int(fused.batch.counts.sum())
+    assert len(fused.batch.gaussians) == int(fused.batch.counts.sum())
     assert [ranked[0][2] for ranked in votes.values()] == fused.batch.counts.tolist()
     for ranked in votes.values():
         assert [score[1] for score in ranked] == sorted((score[1] for score in ranked), reverse=True)
@@ -235,5 +235,5 @@ def test_ties_go_to_more_gaussians_and_then_to_the_lower_id(
 
 
 def test_no_updates_fuse_to_an_empty_map() -> None:
-    assert len(fuse({}).gaussians) == len(union_maps({}).gaussians) == 0
-    assert len(fuse({"ant": group_by_voxel(Gaussians.empty(), GRID)}).gaussians) == 0
+    assert len(fuse({}).batch.gaussians) == len(union_maps({}).gaussians) == 0
+    assert len(fuse({"ant": group_by_voxel(Gaussians.empty(), GRID)}).batch.gaussians) == 0

@@ -332,8 +332,5 @@ def test_forecasts_follow_a_lasting_change() -> None:
 
 
 def test_invalid_settings_are_named() -> None:
-    wrongs = {"seconds_per_frame": 0.0}, {"seconds_per_frame": np.nan}, {"min_iterations": -1}, {"deadline_slack": 1.5}
-    for wrong in wrongs:
-        pytest.raises(InvalidInputError, SchedulerSettings, **wrong).match(next(iter(wrong)))
-    with pytest.raises(InvalidInputError, match="each once, got publishing, publishing"):
-        SchedulerSettings(skip_stages=(SkippableStage.PUBLISHING, SkippableStage.PUBLISHING))
+    for seconds in (0.0, np.nan):
+        pytest.raises(InvalidInputError, SchedulerSettings, seconds).match("seconds_per_frame")

@@ -102,9 +102,7 @@ def test_health_answers_while_a_refinement_runs() -> None:
         running.close()
 
 
-def test_a_server_without_a_plug_in_refuses_a_refinement(
-    fusion: RunningServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_without_a_plug_in_refuses_a_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
     register(monkeypatch, Group.REFINERS)
-    with pytest.raises(MissingPluginError, match="refinement: expected a plug-in"):
-        list(fusion.client.refine())
+    with fusion_server() as t, pytest.raises(MissingPluginError, match="refinement: expected a plug-in"):
+        list(t.client.refine())
