@@ -324,7 +324,7 @@ class Trainer:
 def _drawn(views: Sequence[WindowView], rng: np.random.Generator) -> Iterator[WindowView]:
     """Yield uniformly drawn views without end."""
     while True:
-        yield views[rng.integers(len(views))]
+        yield views[int(rng.integers(len(views)))]
 
 
 def _is_due(iterations: int, interval: int, stage: Stage, scheduler: StageScheduler) -> bool:
