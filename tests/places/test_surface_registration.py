@@ -100,7 +100,7 @@ def test_matches_come_from_a_process_that_is_started_again_when_it_has_grown_or_
     a, _, _ = _views((0.6, 0.8, 20), (0.7, 1.4, -5))
     # two clouds that are the same have the most matches, which the library never frees
     found, processes = [], set()
-    for call in range(100):
+    for call in range(400):
         found.append(matched_motion(_surface(a), _surface(a)))
         assert MATCHER._process is not None
         processes.add(MATCHER._process.pid)
