@@ -44,6 +44,7 @@ _KEYFRAME_PAUSE = 2.0
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
 _JUDGE_DELAY_S = 10.0
+"""The messages and keyframes of this time share one judgement of the voxels."""
 _PAUSE = 4.0
 """Pause after background work, in its durations: it takes a fifth of a core at most."""
 _RETRY_S = 30.0

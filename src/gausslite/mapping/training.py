@@ -295,7 +295,7 @@ class Trainer:
         )
         if self._saturation.enabled:
             self._saturation.observe(view.keyframe.frame.id, report.loss)
-        # averaged over views: after a whole frame, views in turn often end with the same one, which would outweigh
+        # not once a frame: views train in turn, and frames often end with the same one, which alone would be averaged
         self._update_ema(report.visible)
 
     def _update_ema(self, rows: UInt32[ndarray, " m"] | None = None) -> None:

@@ -143,3 +143,17 @@ def test_training_is_independent_of_the_ema() -> None:
     assert len(current) == len(smoothed)
     assert np.abs(current.rgb - smoothed.rgb).max() > 1e-3
     assert_array_equal(with_ema.gaussians(active_only=True).rgb, smoothed.rgb[smoothed.active])
+
+
+def test_each_step_of_the_region_enters_the_ema(monkeypatch: pytest.MonkeyPatch) -> None:
+    averaged: list[int] = []
+    update_ema = SplatTable.update_ema
+
+    def counted(table: SplatTable, horizon: float, rows: np.ndarray | None = None) -> None:
+        averaged.append(int((table.rows[:, UPDATE_COUNT] - table.ema_rows[:, UPDATE_COUNT]).max()))
+        update_ema(table, horizon, rows)
+
+    monkeypatch.setattr(SplatTable, "update_ema", counted)
+    map_of(HORIZON)
+    # the updates of two warm-up iterations and of one step
+    assert max(averaged) <= 3
