@@ -52,6 +52,8 @@ moments that float32 rounds to 0."""
 _BYTES_PER_GAUSSIAN = sum((width or 1) * np.dtype(dtype).itemsize for width, dtype in _COLUMNS.values())
 _ROWS_IN_CACHE = 4096
 """Rows that an update of the EMA reads at once: with their averages 512 KiB, which a core's cache holds."""
+_UPDATES_OF_TRAINED = 100
+"""Updates from which on a row's second moment is typical; the largest number of any row, if that is less."""
 _MIN_UPDATES_PER_HORIZON = 8.0
 """The EMA horizon of a row is at most its number of updates divided by this."""
 
@@ -213,6 +215,20 @@ class SplatTable:
         """Overwrite the Gaussians `ids` with these, with zero optimiser state."""
         self._put(ids, gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
         self._columns["anchor"][ids] = anchor
+
+    def adopt(self, ids: Int64[ndarray, " m"], updates: int, beta2: float) -> None:
+        """Give these Gaussians a number of updates, and in each column the median second moment of the trained rows.
+
+        If no row is trained, nothing changes.
+        """
+        counts = self.rows[:, UPDATE_COUNT].astype(np.float64)
+        trained = np.flatnonzero(counts >= min(_UPDATES_OF_TRAINED, max(counts.max(), 1.0)))
+        if len(trained) == 0:
+            return
+        corrected = self.second_moment[trained] / (1.0 - beta2 ** counts[trained, None])
+        self.second_moment[ids] = np.median(corrected, axis=0) * (1.0 - beta2**updates)
+        self.first_moment[ids] = 0.0
+        self.rows[ids, UPDATE_COUNT] = self.ema_rows[ids, UPDATE_COUNT] = updates
 
     def keep(self, mask: Bool[ndarray, " n"]) -> None:
         """Remove the Gaussians where mask is False; the others keep their optimiser state.
