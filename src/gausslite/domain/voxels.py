@@ -224,6 +224,13 @@ def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
     )
 
 
+def find_in(keys: Int64[ndarray, " v"], wanted: Int64[ndarray, " *n"]) -> Int64[ndarray, " *n"]:
+    """Return the place of each wanted key in these ascending ones, -1 for a key that is absent."""
+    places = np.searchsorted(keys, wanted)
+    is_present = keys.take(places, mode="clip") == wanted if len(keys) else False
+    return np.where(is_present, places, -1)
+
+
 def tombstones(keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """Return a batch of tombstones for these ascending voxel keys."""
     return VoxelBatch(keys, np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint32), Gaussians.empty())
@@ -272,10 +279,8 @@ def crop_to_box(batch: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> Voxe
 
 def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """Return the voxels of the batch that are in `keys`, which may be unsorted."""
-    wanted = np.unique(keys)
-    rows = np.searchsorted(batch.keys, wanted)
-    # -1, which is no key, stands behind the last one: a search beyond it finds nothing
-    rows = rows[np.append(batch.keys, np.int64(-1))[rows] == wanted]
+    rows = find_in(batch.keys, np.unique(keys))
+    rows = rows[rows >= 0]
     counts, starts = batch.counts[rows], batch.offsets[rows]
     gaussians = batch.gaussians.take(gather_rows(starts, counts))
     return VoxelBatch(batch.keys[rows], batch.kappa_sums[rows], counts, gaussians)
