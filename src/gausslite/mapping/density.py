@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -19,15 +18,7 @@ _SPLIT_OFFSET = math.sqrt(1.0 - 1.0 / _SPLIT_SHRINK**2)
 """Offset of each half in standard deviations of the parent: the two together keep its mean and covariance."""
 
 
-@dataclass(frozen=True, slots=True)
-class DensityChange:
-    """Numbers of cloned and of split Gaussians; each adds one Gaussian."""
-
-    cloned: int
-    split: int
-
-
-def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> DensityChange:
+def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> None:
     """Clone small and split large Gaussians of high image gradient, within the cap and max_growth.
 
     The Gaussians with the largest gradients have priority. The two children render nearly like their parent, because
@@ -40,19 +31,15 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
     chosen = _largest_above(mean_gradient, settings.min_mean_gradient, max_added)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m  # 3DGS: small ones lack neighbours, large ones detail
-    to_clone, to_split = chosen[small], chosen[~small]
-    _split(table, to_split)
-    _clone(table, to_clone)
+    _split(table, chosen[~small])
+    _clone(table, chosen[small])
     for statistic in (GRAD_2D_SUM, GRAD_2D_COUNT):
         table.first_moment[:, statistic] = 0.0  # the gradients of before say nothing of the children
-    return DensityChange(cloned=len(to_clone), split=len(to_split))
 
 
-def prune(table: SplatTable, settings: DensitySettings) -> int:
-    """Remove the Gaussians of opacity below `min_opacity`; return their number."""
-    before = table.count
+def prune(table: SplatTable, settings: DensitySettings) -> None:
+    """Remove the Gaussians of opacity below `min_opacity`."""
     table.keep(table.opacities >= settings.min_opacity)
-    return before - table.count
 
 
 def _largest_above(gradient: Float32[ndarray, " n"], threshold: float, max_count: int) -> Int64[ndarray, " m"]:

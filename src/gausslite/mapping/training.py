@@ -143,13 +143,12 @@ class Trainer:
         self._saturation = RegionSaturation(settings.saturation)
         self._rotations = {stage: ViewRotation() for stage in (Stage.WARM_UP, Stage.ACTIVE)}
         self._iterations = 0
-        self._since_prune = 0
-        self._since_densify = 0
+        self._since = {Stage.PRUNING: 0, Stage.DENSIFICATION: 0}
 
     def state(self) -> State:
         """Return the iteration counts, the measured saturation and the visited views: all state between two frames."""
         return {
-            "counts": int_array(self._iterations, self._since_prune, self._since_densify),
+            "counts": int_array(self._iterations, *self._since.values()),
             **add_prefix("saturation", self._saturation.state()),
             **add_prefix(Stage.WARM_UP, self._rotations[Stage.WARM_UP].state()),
             **add_prefix(Stage.ACTIVE, self._rotations[Stage.ACTIVE].state()),
@@ -157,7 +156,8 @@ class Trainer:
 
     def restore(self, state: State) -> None:
         """Continue from another trainer's state. Raises MapFileError."""
-        self._iterations, self._since_prune, self._since_densify = get_counts(state, "counts", 3)
+        self._iterations, *since = get_counts(state, "counts", 3)
+        self._since = dict(zip(self._since, since, strict=True))
         self._saturation.restore(select_prefix(state, "saturation"))
         for stage, rotation in self._rotations.items():
             rotation.restore(select_prefix(state, stage))
@@ -247,7 +247,7 @@ class Trainer:
                 with scheduler.timing(stage):
                     self._iterate(binding, stage, turns[stage])
                 done += 1
-                if self._prune_is_due(scheduler) or self._densify_is_due(scheduler):
+                if any(self._is_due(due, scheduler) for due in self._since):
                     return done, False
         return done, True
 
@@ -264,8 +264,7 @@ class Trainer:
                 if images + view.roi_share > 1.0:  # no more tiles than one image: an iteration has one cost
                     break
         self._iterations += 1
-        self._since_prune += 1
-        self._since_densify += 1
+        self._since = {due: iterations + 1 for due, iterations in self._since.items()}
 
     def _train_full_images(self, binding: _Binding, turns: Iterator[WindowView]) -> None:
         """Train a view in full size, or four in half size: as many pixels.
@@ -302,31 +301,25 @@ class Trainer:
         if self._settings.optimization.ema_updates > 0:
             self._table.update_ema(self._settings.optimization.ema_updates, rows)
 
-    def _prune_is_due(self, scheduler: StageScheduler) -> bool:
-        return _is_due(self._since_prune, self._settings.density.prune_every, Stage.PRUNING, scheduler)
-
-    def _densify_is_due(self, scheduler: StageScheduler) -> bool:
-        return _is_due(self._since_densify, self._settings.density.densify_every, Stage.DENSIFICATION, scheduler)
+    def _is_due(self, stage: Stage, scheduler: StageScheduler) -> bool:
+        """True after the stage's interval; a frame without time may postpone it to twice the interval."""
+        density, iterations = self._settings.density, self._since[stage]
+        interval = density.prune_every if stage is Stage.PRUNING else density.densify_every
+        return iterations >= 2 * interval or (iterations >= interval and scheduler.has_time_for(stage))
 
     def _control_density(self, extent_m: float, scheduler: StageScheduler) -> None:
         """Clone, split and prune if due (Sec. III-D.2)."""
-        density = self._settings.density
-        if self._prune_is_due(scheduler):
+        if self._is_due(Stage.PRUNING, scheduler):
             with scheduler.timing(Stage.PRUNING):
-                prune(self._table, density)
-            self._since_prune = 0
-        if self._densify_is_due(scheduler):
+                prune(self._table, self._settings.density)
+            self._since[Stage.PRUNING] = 0
+        if self._is_due(Stage.DENSIFICATION, scheduler):
             with scheduler.timing(Stage.DENSIFICATION):
-                densify(self._table, density, extent_m)
-            self._since_densify = 0
+                densify(self._table, self._settings.density, extent_m)
+            self._since[Stage.DENSIFICATION] = 0
 
 
 def _drawn(views: Sequence[WindowView], rng: np.random.Generator) -> Iterator[WindowView]:
     """Yield uniformly drawn views without end."""
     while True:
         yield views[int(rng.integers(len(views)))]
-
-
-def _is_due(iterations: int, interval: int, stage: Stage, scheduler: StageScheduler) -> bool:
-    """True after `interval` iterations; a frame without time may postpone the stage to twice the interval."""
-    return iterations >= 2 * interval or (iterations >= interval and scheduler.has_time_for(stage))
