@@ -64,8 +64,6 @@ NEAR_M, DILATION_PX2 = 0.05, 0.3
 MIN_ALPHA = 1.0 / 255.0
 TANGENT_MARGIN = 1.3
 """Limit of the tangents in the Jacobian, as a factor of half the field of view."""
-MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
-"""Limits of a moving camera's exposure time, in readouts, and of 1 - s readout / height."""
 _MIN_SCALE_M = 1e-7
 _MIN_OPACITY = 1e-6
 
