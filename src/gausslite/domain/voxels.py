@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class VoxelBatch:
     kappa_sums: UInt64[ndarray, " v"]
     counts: UInt32[ndarray, " v"]
     gaussians: Gaussians
+    offsets: Int64[ndarray, " v1"] = field(init=False, repr=False)
+    """gaussians[offsets[i] : offsets[i + 1]] belong to keys[i]; kept, as a tile of a large map is read under a lock."""
 
     def __post_init__(self) -> None:
         v = len(self.keys)
@@ -45,7 +47,10 @@ class VoxelBatch:
         require_array("voxel batch counts", self.counts, (v,), np.uint32)
         if v > 1 and not (np.diff(self.keys) > 0).all():
             raise InvalidInputError("voxel batch keys: expected strictly ascending voxel keys")
-        total = int(self.counts.sum(dtype=np.int64))
+        offsets = np.zeros(v + 1, np.int64)
+        np.cumsum(self.counts, dtype=np.int64, out=offsets[1:])
+        object.__setattr__(self, "offsets", offsets)
+        total = int(offsets[-1])
         if total != len(self.gaussians):
             raise InvalidInputError(
                 f"voxel batch counts: expected a sum of {len(self.gaussians)} (the Gaussians present), got {total}"
@@ -53,11 +58,6 @@ class VoxelBatch:
 
     def __len__(self) -> int:
         return len(self.keys)
-
-    @property
-    def offsets(self) -> Int64[ndarray, " v1"]:
-        """gaussians[offsets[i] : offsets[i + 1]] belong to keys[i]."""
-        return np.concatenate([np.zeros(1, np.int64), np.cumsum(self.counts, dtype=np.int64)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
