@@ -23,6 +23,7 @@ def table_of(scales_m: list[float], gradients: list[float], capacity: int) -> Sp
     table.append_rows(rows, target % 2 == 1, (10 * target).astype(np.uint32), target)
     table.first_moment[:] = 3.0
     table.second_moment[:] = 4.0
+    table.roi_evidence[:] = 20 - target
     table.first_moment[:, GRAD_2D_COUNT] = 5.0
     table.first_moment[:, GRAD_2D_SUM] = 5.0 * np.array(gradients, np.float32)
     return table
@@ -63,11 +64,12 @@ def test_split_keeps_mean_and_covariance() -> None:
     np.testing.assert_allclose(np.sqrt(variance_m2), [0.02, 0.1, 0.05], rtol=1e-4)
 
 
-def test_children_inherit_columns_and_have_no_optimiser_state() -> None:
+def test_children_inherit_columns_and_new_rows_have_no_optimiser_state() -> None:
     table = table_of([0.001, 0.1, 0.1], [1e-3, 1e-3, 1e-5], capacity=10)
     densify(table, SETTINGS, EXTENT_M)
     np.testing.assert_array_equal(table.kappa, 10 * table.target)
     np.testing.assert_array_equal(table.active, table.target % 2 == 1)
+    np.testing.assert_array_equal(table.roi_evidence, 20 - table.target)
     unchanged, new = [0, 2], [1, 3, 4]
     assert (table.first_moment[unchanged, :OPACITY_LOGIT] == 3.0).all()
     assert (table.second_moment[unchanged] == 4.0).all()
