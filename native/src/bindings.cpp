@@ -82,9 +82,9 @@ struct Scene {
   FrameInput input;
 
   Scene(const float* rows, size_t count, const Intrinsics& intrinsics, const Matrix4& T_camera_world,
-        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids, const Motion& motion,
-        float dilation_px2 = Camera{}.dilation_px2) {
+        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids, const Motion& motion, float dilation_px2) {
     require(count < (size_t{1} << 31), "rows: too many");
+    require(dilation_px2 > 0.0f && dilation_px2 < 1.0f, "dilation_px2: expected more than 0 and less than 1");
     input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world, motion)};
     input.camera.dilation_px2 = dilation_px2;
     if (tiles) {
@@ -119,8 +119,8 @@ auto visible_ids(const Rasterizer& rasterizer) {
 }
 
 nb::tuple forward(Rasterizer& self, ConstRowTable rows, const Intrinsics& intrinsics, Matrix4 T_camera_world,
-                  std::optional<TileMask> tiles, std::optional<Ids> ids, const Motion& motion) {
-  const Scene scene(rows.data(), rows.shape(0), intrinsics, T_camera_world, tiles, ids, motion);
+                  std::optional<TileMask> tiles, std::optional<Ids> ids, const Motion& motion, float dilation_px2) {
+  const Scene scene(rows.data(), rows.shape(0), intrinsics, T_camera_world, tiles, ids, motion, dilation_px2);
   const size_t height = size_t(scene.input.camera.height), width = size_t(scene.input.camera.width);
   auto rgb = new_array<float>(height, width, 3);
   auto depth_m = new_array<float>(height, width);
@@ -179,9 +179,7 @@ struct StepScene {
         tiles(tiles),
         ids(ids),
         motion(motion),
-        dilation_px2(dilation_px2) {
-    require(dilation_px2 > 0.0f && dilation_px2 < 1.0f, "dilation_px2: expected more than 0 and less than 1");
-  }
+        dilation_px2(dilation_px2) {}
 };
 
 // Tables, settings and masks of a step.
@@ -287,7 +285,7 @@ NB_MODULE(_kernels, m) {
       .def_prop_ro("frame", &Rasterizer::frame, "Number of the latest forward or step.")
       .def("forward", &forward, nb::arg("rows").noconvert(), nb::arg("intrinsics"),
            nb::arg("T_camera_world").noconvert(), nb::arg("tiles").noconvert().none(),
-           nb::arg("ids").noconvert().none(), nb::arg("motion").none(),
+           nb::arg("ids").noconvert().none(), nb::arg("motion").none(), nb::arg("dilation_px2"),
            "Return rgb, depth_m, alpha and the frame number.")
       .def("backward", &backward, nb::arg("frame"), nb::arg("row_count"), nb::arg("d_rgb").noconvert(),
            nb::arg("d_depth_m").noconvert(), nb::arg("d_alpha").noconvert(),

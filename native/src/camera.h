@@ -15,8 +15,8 @@ struct Camera {
   float t_camera_world[3];
   float fx, fy, cx, cy;  // pixels; pixel (u, v) has its centre at (u + 0.5, v + 0.5)
   int width, height;
-  float dilation_px2 = 0.3f;  // added to the diagonal of the 2D covariance
-  bool moves = false;         // whether the image model includes `motion`
+  float dilation_px2;  // added to the diagonal of the 2D covariance
+  bool moves = false;  // whether the image model includes `motion`
   CameraMotion motion;
 };
 

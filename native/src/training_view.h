@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // A training image in tiles, padded to whole tiles, with pixel weights per tile. It is prepared once and used in many
-// steps. The mapper picks views at random, so that each step loads its view from memory. Therefore the format is
-// compact.
+// steps. The mapper's views take turns, so that each step loads its view from memory. Therefore the format is compact.
 #pragma once
 
 #include <cstdint>

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.render.rasterizer import MAX_READOUT_SHARE, MIN_ROW_RATE, TANGENT_MARGIN
+from gausslite.domain.camera import MAX_READOUT_SHARE, MIN_ROW_RATE, Camera, CameraMotion
+from gausslite.render.rasterizer import TANGENT_MARGIN
 
 Covariances: TypeAlias = tuple[Tensor, Tensor, Tensor]
 """var x, cov xy, var y of the splats in the image, px²."""

@@ -112,12 +112,13 @@ class CudaRasterizer:
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         require_table("rows", rows)
         require_scene(len(rows), camera, T_camera_world, subset)
         on_device = to_device(rows, self._kernels.device)
-        device_camera = DeviceCamera.of(camera, self._kernels.device, motion)
+        device_camera = DeviceCamera.of(camera, self._kernels.device, motion, dilation_px2)
         graph = self._render(on_device, device_camera, T_camera_world, subset, Window.whole(camera), pose_gradient=True)
         channels = graph.channels.detach().cpu().numpy()
         return Rendering(

@@ -1,9 +1,9 @@
 """Choose the keyframes that are sent for the joint refinement, by what they add to the coverage of ROI and mission.
 
 A keyframe covers the voxels of its ROI pixels and, in coarser cells, the rest of the scene, each from the octant of its
-viewing direction. Coverage is a submodular set function: the gain of a keyframe shrinks as others are selected. So the
-greedy choice by gain is within 1 - 1/e of the best one (Nemhauser et al. 1978). When the selection is full, a new
-keyframe replaces the one with the smallest loss.
+viewing direction. Coverage is a submodular set function: the gain of a keyframe shrinks as others are selected. They
+are selected as they arrive, if their gain is large enough. When the selection is full, a new keyframe replaces the one
+with the smallest loss if it gains 1.5 times that loss. No bound of the greedy algorithm holds for such a choice.
 """
 
 from __future__ import annotations

@@ -16,9 +16,9 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
-from gausslite.domain.voxels import VoxelBatch, merge_batches, select_voxels
+from gausslite.domain.voxels import VoxelBatch, replace_voxels
 from gausslite.fusion.vote import PREFERRED, Preferred, fuse, source_hashes
-from gausslite.render.rasterizer import RGB, Rasterizer, gaussians_to_rows
+from gausslite.render.rasterizer import RGB, Rasterizer, gaussians_to_rows, reduced_dilation_px2
 
 _PER_AGENT, _IN_ALL, _WIDTH_PX = 8, 32, 320
 """Keyframes of each agent and of all, and the width to which they are reduced."""
@@ -49,11 +49,11 @@ class ResidualVote:
         """Return whether several maps have Gaussians in a voxel."""
         return len(self._ranked) > 0
 
-    def steps(self, frames: Sequence[Frame], rasterizer: Rasterizer) -> Iterator[None]:
-        """Judge one map after the other, once; it stops where its reader does. frames: keyframes in the fused frame."""
+    def steps(self, frames: Sequence[tuple[Frame, float]], rasterizer: Rasterizer) -> Iterator[None]:
+        """Judge one map after another, once; it stops where its reader does. frames: `reduced`, in the fused frame."""
         for number in np.unique(self._ranked.agent_index).tolist():
-            own, batch = np.flatnonzero(self._ranked.agent_index == number), self._maps[self._ranked.agents[number]]
-            shown = merge_batches(batch, select_voxels(self._voted.batch, ~np.isin(self._voted.batch.keys, batch.keys)))
+            own = np.flatnonzero(self._ranked.agent_index == number)
+            shown = replace_voxels(self._voted.batch, self._maps[self._ranked.agents[number]])
             places = np.searchsorted(shown.keys, self._ranked.scores["keys"][own])
             weights, squared = _residuals(shown, frames, rasterizer)[:, places]
             self._errors[own] = np.where(weights >= _MIN_PIXELS, squared / np.maximum(weights, _MIN_PIXELS), np.inf)
@@ -71,11 +71,14 @@ class ResidualVote:
         return preferred
 
 
-def _residuals(shown: VoxelBatch, frames: Sequence[Frame], rasterizer: Rasterizer) -> Float64[ndarray, "2 v"]:
+def _residuals(
+    shown: VoxelBatch, frames: Sequence[tuple[Frame, float]], rasterizer: Rasterizer
+) -> Float64[ndarray, "2 v"]:
     """Return the sums over the frames' pixels of each voxel's blending weight, and of the weight times the error."""
     rows, sums = gaussians_to_rows(shown.gaussians), np.zeros((2, len(shown.gaussians)))
-    for frame in frames:
-        rendering = rasterizer.forward(rows, frame.camera, inverse(frame.T_world_camera), motion=frame.motion)
+    for frame, dilation_px2 in frames:
+        T_camera_world, motion = inverse(frame.T_world_camera), frame.motion
+        rendering = rasterizer.forward(rows, frame.camera, T_camera_world, motion=motion, dilation_px2=dilation_px2)
         difference = np.clip(rendering.rgb, 0.0, 1.0) - frame.rgb / np.float32(255.0)
         # the gradient of a Gaussian's colour is the sum of its weights
         d_rgb, none = np.zeros_like(rendering.rgb), np.zeros_like(rendering.depth_m)
@@ -84,9 +87,9 @@ def _residuals(shown: VoxelBatch, frames: Sequence[Frame], rasterizer: Rasterize
     return np.add.reduceat(sums, np.cumsum(shown.counts, dtype=np.int64) - shown.counts, axis=1)
 
 
-def reduced(frame: Frame) -> Frame:
-    """Return a small frame without depth."""
+def reduced(frame: Frame) -> tuple[Frame, float]:
+    """Return a small frame without depth, and the dilation in px² with which it is rendered."""
     camera = frame.camera.narrower(_WIDTH_PX)
-    shape = camera.height_px, camera.width_px
-    rgb = cv2.resize(frame.rgb, shape[::-1], interpolation=cv2.INTER_AREA)
-    return replace(frame, rgb=rgb, depth_m=np.zeros(shape, np.float32), camera=camera)
+    rgb = cv2.resize(frame.rgb, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
+    small = replace(frame, rgb=rgb, depth_m=np.zeros(rgb.shape[:2], np.float32), camera=camera)
+    return small, reduced_dilation_px2(frame.camera.width_px / camera.width_px)

@@ -17,6 +17,7 @@ from numpy import ndarray
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.pose import inverse, transform_points
+from gausslite.domain.voxels import find_in
 from gausslite.mapping.window_view import roi_weights
 from gausslite.render.rasterizer import FULL_FRAME, Rasterizer, Subset, TrainingView
 from gausslite_refinement.refine_input import RefineInput
@@ -69,6 +70,7 @@ def views_of(rows: Float32[ndarray, "n 16"], vote: RefineInput, rasterizer: Rast
     keys = np.concatenate([np.zeros(0, np.int64), *vote.regions.values()])
     owners = np.repeat(np.arange(len(vote.regions), dtype=np.int16), [len(own) for own in vote.regions.values()])
     order = np.argsort(keys)
+    keys, owners = keys[order], np.append(owners[order], np.int16(BACKGROUND))
     views = []
     for agent_id, frame in ((keyframe.agent_id, keyframe.frame) for keyframe in vote.keyframes):
         rendering = rasterizer.forward(rows, frame.camera, inverse(frame.T_world_camera), motion=frame.motion)
@@ -82,11 +84,8 @@ def views_of(rows: Float32[ndarray, "n 16"], vote: RefineInput, rasterizer: Rast
         agrees = (behind_m <= tolerance_m) & (difference <= _COLOUR)
         points_m = back_project(surface_m, frame.camera)[explained]
         of_pixel = np.full(surface_m.shape, _UNEXPLAINED, np.int16)
-        of_pixel[explained] = BACKGROUND
-        if len(keys):
-            found = vote.grid.keys(transform_points(frame.T_world_camera, points_m).astype(np.float32))
-            place = order[np.minimum(np.searchsorted(keys, found, sorter=order), len(keys) - 1)]
-            of_pixel[explained] = np.where(keys[place] == found, owners[place], BACKGROUND)
+        found = vote.grid.keys(transform_points(frame.T_world_camera, points_m).astype(np.float32))
+        of_pixel[explained] = owners[find_in(keys, found)]
         views.append(RefineView(agent_id, frame, float(agrees[explained].mean()), of_pixel))
     return views
 

@@ -3,22 +3,27 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, fusion_server, keys, make_subset, photograph
+from fusion_running import CAMERA, GRID, frame, fusion_server, keys, make_subset, photograph
+from sample_gaussians import plain_gaussians
 from torch_oracle.rasterizer import ReferenceRasterizer
 from waiting import wait_until
 
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import CodecError
-from gausslite.domain.voxels import RoiSubset
+from gausslite.domain.voxels import RoiSubset, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import PREFERRED
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import gaussians_to_rows
 from gausslite.wire.convert import decode_frame, frame_to_message
 from gausslite_refinement.refiner import RefinementWorker
-from gausslite_refinement.residual_vote import spread_of
+from gausslite_refinement.residual_vote import ResidualVote, reduced, spread_of
 
 CELLS = {cell: [3] * 4 for cell in (-1, 0, 1)}
 SHARED = {0: [3] * 4}
@@ -135,6 +140,19 @@ def test_a_server_judges_in_the_background() -> None:
         t.contribute_subsets(sessions["good"], make_subset("good", 1, CELLS))
         t.contribute_subsets(sessions["bad"], opposite(1, SHARED))
         wait_until(lambda: [agent.won_voxels for agent in t.client.status().agents] == [0, 3])
+
+
+def test_a_detailed_map_wins_in_reduced_keyframes_that_it_explains() -> None:
+    numbers, camera = np.random.default_rng(0).random((6000, 5)), Camera.centred(640.0, 640, 32)
+    means_m = np.column_stack([numbers[:, 0] - 0.5, 0.05 * numbers[:, 1] - 0.025, np.full(6000, 1.001)])
+    truth = plain_gaussians(means_m, scales_m=0.0012, rgb=numbers[:, 2:], kappa=1)  # less than a pixel
+    greyer = plain_gaussians(means_m, scales_m=0.0012, rgb=0.3 * numbers[:, 2:] + 0.35, kappa=2)
+    maps = {name: group_by_voxel(own, GRID) for name, own in (("greyer", greyer), ("truth", truth))}
+    rasterizer, vote = CpuRasterizer(threads=1), ResidualVote(maps)
+    image = rasterizer.forward(gaussians_to_rows(truth), camera, np.eye(4)).rgb
+    rgb = np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
+    list(vote.steps([reduced(replace(frame(1, camera), rgb=rgb))], rasterizer))
+    assert vote.result()["keys"].tolist() == maps["truth"].keys.tolist()
 
 
 def test_some_keyframes_of_each_agent_judge() -> None:

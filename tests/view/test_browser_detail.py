@@ -1,6 +1,7 @@
 """A browser first gets merged splats, then as many as it draws fast enough."""
 
 import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -56,21 +57,18 @@ def drawn_counts(browser, page, until):
 def test_a_browser_that_answers_like_a_gpu_goes_from_the_first_level_to_all_splats(monkeypatch):
     monkeypatch.setattr(browser_detail, "HARDWARE_RESPONSE_S", 1000.0)
     monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
-    page, count = open_page(0, "test"), 5 * PREVIEW_COUNT
-    try:
+    count = 5 * PREVIEW_COUNT
+    with closing(open_page(0, "test")) as page:
         page.show(ViewContents.of_one_agent(points(count)))
         with open_browser() as browser:
             assert drawn_counts(browser, page, f"window.drawn.at(-1) == {count}") <= {PREVIEW_COUNT, count}
-    finally:
-        page.close()
 
 
 @pytest.mark.slow
 def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_more_when_it_is_fast(monkeypatch):
     monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 0.0)
     monkeypatch.setattr(browser_detail, "_RETRY_S", 0.01)
-    page = open_page(0, "test")
-    try:
+    with closing(open_page(0, "test")) as page:
         page.show(ViewContents.of_one_agent(points(3 * PREVIEW_COUNT)))
         with open_browser() as browser:
             browser.add_init_script(COUNT_DRAWN)
@@ -88,8 +86,6 @@ def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_mor
             tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
             page.show(ViewContents.of_one_agent(points(PREVIEW_COUNT // 2)))
             tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT // 2}")
-    finally:
-        page.close()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import json
 import re
 import time
 from argparse import Namespace
+from contextlib import closing
 from dataclasses import replace
 from urllib.parse import urlsplit
 
@@ -145,8 +146,7 @@ def test_the_time_slider_ends_the_trajectory_and_leaves_out_later_objects(page):
 
 
 def test_a_live_page_set_back_keeps_the_earlier_map_and_follows_again_at_the_end():
-    page = open_page(0, "test")
-    try:
+    with closing(open_page(0, "test")) as page:
         for second in range(1, 101):
             means_m = np.stack([np.arange(second), np.zeros(second), np.ones(second)], axis=1)
             contents = replace(ViewContents.of_one_agent(plain_gaussians(means_m)), state_ns=second * 1_000_000_000)
@@ -166,20 +166,15 @@ def test_a_live_page_set_back_keeps_the_earlier_map_and_follows_again_at_the_end
         page.remember(contents)
         page.show(contents)
         assert control(page, "Seconds").value == control(page, "Seconds").max == pytest.approx(4.0)
-    finally:
-        page.close()
 
 
 def test_a_run_without_a_history_says_so(run_folder):
     (run_folder / "map_history.safetensors").unlink()
     contents = read_contents(run_folder)
-    page = open_page(0, "test")
-    try:
+    with closing(open_page(0, "test")) as page:
         page.show_run(contents, read_past(run_folder, contents))
         control(page, "Seconds").value = 1.0
         assert "no earlier map is known" in text(page)
-    finally:
-        page.close()
 
 
 def test_share_links_are_disabled(page):

@@ -1,6 +1,7 @@
 """A person corrects objects on the page of a run and of a fusion server: the page and everybody see it."""
 
 import html
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ def _edit(panel: ObjectsPanel, kind: EditKind, value: str = "") -> Any:
 def test_a_person_corrects_the_objects_of_a_run(tmp_path: Path) -> None:
     run, page, shown = write_run(tmp_path / "run"), SeenPage(), []
     panel = ObjectsPanel(page, RunMemory(run), lambda: shown.append(edited_objects(run)))
-    try:
+    with closing(page):
         assert "expected one of the map&#x27;s objects" in _edit(panel, EditKind.DELETE)
         panel.show(read_contents(run))
         assert "expected a value, got none" in _edit(panel, EditKind.RENAME)
@@ -46,8 +47,6 @@ def test_a_person_corrects_the_objects_of_a_run(tmp_path: Path) -> None:
         _edit(panel, EditKind.UNDO, "1")
         assert [found.noun for found in edited_objects(run)] == ["mug"]
         assert [edit.kind for edit in read_edits(run)] == [EditKind.RENAME, EditKind.UNDO]
-    finally:
-        page.close()
 
 
 def test_a_deleted_object_leaves_the_page_of_a_server() -> None:
@@ -88,7 +87,7 @@ def test_the_corners_of_an_area_are_on_the_floor(
 ) -> None:
     run, page = write_run(tmp_path / "run"), SeenPage()
     panel = ObjectsPanel(page, RunMemory(run), lambda: None)
-    try:
+    with closing(page):
         panel.show(
             replace(read_contents(run), keyframes=(), times_ns=np.zeros(1, np.int64), T_world_camera=UPRIGHT[None])
         )
@@ -98,15 +97,13 @@ def test_the_corners_of_an_area_are_on_the_floor(
         if "3 corners" in expected:
             [bay] = read_areas(run)
             assert np.allclose(bay.corners_m, [(-2.0, 2.5, 0.0), (2.0, 2.5, 0.0), (0.0, 5.0, 0.0)], atol=1e-6)
-    finally:
-        page.close()
 
 
 @pytest.mark.slow
 def test_a_person_draws_an_area_from_above(tmp_path: Path) -> None:
     run, page = write_run(tmp_path / "run"), SeenPage()
     panel = ObjectsPanel(page, RunMemory(run), lambda: panel.show(read_contents(run)))
-    try:
+    with closing(page):
         page.show(read_contents(run))
         panel.show(read_contents(run))
         with open_browser((900, 700)) as browser:
@@ -124,5 +121,3 @@ def test_a_person_draws_an_area_from_above(tmp_path: Path) -> None:
         [bay] = read_areas(run)
         assert (bay.name, len(bay.corners_m)) == ("bay 3", 4)
         assert "area bay 3" in text(page)
-    finally:
-        page.close()

@@ -1,5 +1,7 @@
 """The plots of PSNR get the region's and the image's values; an empty region and an exact rendering add no point."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
@@ -13,8 +15,7 @@ REGION, FULL = "training PSNR, task's region (dB)", "training PSNR, full image (
 
 
 def test_region_and_image_have_their_own_values():
-    page = open_page(0, "test")
-    try:
+    with closing(open_page(0, "test")) as page:
         quality = QualityPlot(page.server.gui)
         rgb = np.full((8, 10, 3), 100, np.uint8)
         rendered = rgb.astype(np.float32) / 255
@@ -30,5 +31,3 @@ def test_region_and_image_have_their_own_values():
         full_db, (region_db,) = plot(page, FULL)["dB"], plot(page, REGION)["dB"]
         assert region_db == pytest.approx(20.0, abs=0.01)
         assert full_db[0] == pytest.approx(20.0 + 10 * np.log10(2), abs=0.01)
-    finally:
-        page.close()

@@ -27,8 +27,8 @@ _MAX_SLOPE = 100.0
 """Largest tangent of a ray's angle to the optical axis (89.4 degrees); steeper rays are not a pinhole camera."""
 MAX_READOUT_S = 0.1
 MAX_EXPOSURE_S = 0.1
-_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
-"""Limits as in the rasterizer."""
+MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
+"""Limits of a moving camera's exposure time, in readouts, and of 1 - s readout / height (render.rasterizer)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,8 +252,8 @@ class CameraMotion:
         tangent = points_m[:, 1] / points_m[:, 2]
         rows_per_s = camera.fy_px * (velocity[:, 1] - tangent * velocity[:, 2]) / points_m[:, 2]
         row_shares = (camera.fy_px * tangent + camera.cy_px) / camera.height_px
-        readout_factor = np.maximum(1.0 - rows_per_s * self.readout_s / camera.height_px, _MIN_READOUT_FACTOR)
-        shares = np.clip((row_shares - 0.5) / readout_factor, -_MAX_READOUT_SHARE, _MAX_READOUT_SHARE)
+        readout_factor = np.maximum(1.0 - rows_per_s * self.readout_s / camera.height_px, MIN_ROW_RATE)
+        shares = np.clip((row_shares - 0.5) / readout_factor, -MAX_READOUT_SHARE, MAX_READOUT_SHARE)
         result: Float64[ndarray, "n 3"] = points_m + (self.readout_s * shares)[:, None] * velocity
         return result
 

@@ -21,7 +21,7 @@ from gausslite.domain.pose import transform_points
 class Gaussians:
     """n Gaussians (Sec. III-A): geometry and colour, plus active flag, kappa and target index.
 
-    kappa counts the active-phase iterations that trained a Gaussian; target indexes TaskGraph.targets (-1 none).
+    kappa counts the active phase's steps that trained a Gaussian; target indexes TaskGraph.targets (-1 none).
     """
 
     means_m: Float32[ndarray, "n 3"]  # μ, in the world

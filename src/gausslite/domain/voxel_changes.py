@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
-from gausslite.domain.voxels import VoxelIndex, tiles_of
+from gausslite.domain.voxels import VoxelIndex, find_in, tiles_of
 
 
 def hash_columns(*columns: NDArray[Any]) -> UInt64[ndarray, " n"]:
@@ -132,9 +132,8 @@ class VoxelChangeTracker:
         previous = self.signatures
         if len(previous.keys) == 0:
             return np.zeros(len(current.keys), np.bool_)
-        place = np.minimum(np.searchsorted(previous.keys, current.keys), len(previous.keys) - 1)
-        same_values = (previous.values[place] == current.values).all(axis=1)
-        unchanged: Bool[ndarray, " v"] = (previous.keys[place] == current.keys) & same_values
+        place = find_in(previous.keys, current.keys)
+        unchanged: Bool[ndarray, " v"] = (place >= 0) & (previous.values[place] == current.values).all(axis=1)
         return unchanged
 
     def _store(self, current: VoxelSignatures, kept: VoxelSignatures) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class VoxelBatch:
     kappa_sums: UInt64[ndarray, " v"]
     counts: UInt32[ndarray, " v"]
     gaussians: Gaussians
+    offsets: Int64[ndarray, " v1"] = field(init=False, repr=False)
+    """gaussians[offsets[i] : offsets[i + 1]] belong to keys[i]; kept, as a tile of a large map is read under a lock."""
 
     def __post_init__(self) -> None:
         v = len(self.keys)
@@ -45,7 +47,10 @@ class VoxelBatch:
         require_array("voxel batch counts", self.counts, (v,), np.uint32)
         if v > 1 and not (np.diff(self.keys) > 0).all():
             raise InvalidInputError("voxel batch keys: expected strictly ascending voxel keys")
-        total = int(self.counts.sum(dtype=np.int64))
+        offsets = np.zeros(v + 1, np.int64)
+        np.cumsum(self.counts, dtype=np.int64, out=offsets[1:])
+        object.__setattr__(self, "offsets", offsets)
+        total = int(offsets[-1])
         if total != len(self.gaussians):
             raise InvalidInputError(
                 f"voxel batch counts: expected a sum of {len(self.gaussians)} (the Gaussians present), got {total}"
@@ -53,11 +58,6 @@ class VoxelBatch:
 
     def __len__(self) -> int:
         return len(self.keys)
-
-    @property
-    def offsets(self) -> Int64[ndarray, " v1"]:
-        """gaussians[offsets[i] : offsets[i + 1]] belong to keys[i]."""
-        return np.concatenate([np.zeros(1, np.int64), np.cumsum(self.counts, dtype=np.int64)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,6 +224,13 @@ def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
     )
 
 
+def find_in(keys: Int64[ndarray, " v"], wanted: Int64[ndarray, " *n"]) -> Int64[ndarray, " *n"]:
+    """Return the place of each wanted key in these ascending ones, -1 for a key that is absent."""
+    places = np.searchsorted(keys, wanted)
+    is_present = keys.take(places, mode="clip") == wanted if len(keys) else False
+    return np.where(is_present, places, -1)
+
+
 def tombstones(keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """Return a batch of tombstones for these ascending voxel keys."""
     return VoxelBatch(keys, np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint32), Gaussians.empty())
@@ -272,10 +279,8 @@ def crop_to_box(batch: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> Voxe
 
 def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
     """Return the voxels of the batch that are in `keys`, which may be unsorted."""
-    wanted = np.unique(keys)
-    rows = np.searchsorted(batch.keys, wanted)
-    # -1, which is no key, stands behind the last one: a search beyond it finds nothing
-    rows = rows[np.append(batch.keys, np.int64(-1))[rows] == wanted]
+    rows = find_in(batch.keys, np.unique(keys))
+    rows = rows[rows >= 0]
     counts, starts = batch.counts[rows], batch.offsets[rows]
     gaussians = batch.gaussians.take(gather_rows(starts, counts))
     return VoxelBatch(batch.keys[rows], batch.kappa_sums[rows], counts, gaussians)

@@ -7,7 +7,6 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import reduce
 from threading import Lock
 
 import numpy as np
@@ -25,7 +24,6 @@ from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import (
     VoxelBatch,
     VoxelGrid,
-    empty_batch,
     group_by_voxel,
     merge_batches,
     select_keys,
@@ -392,7 +390,7 @@ class FusedMapLayers:
             voted = keys[self._voted_log.find(keys)["revisions"] > refined.revision]
             parts.append(select_keys(refined.batch, np.setdiff1d(keys, voted)))
         parts += [self._votes.batch(name, own) for name, own in self._change_log.winners(voted).items()]
-        batch = reduce(merge_batches, parts, empty_batch())
+        batch = merge_batches(*parts)
         # a commit may have stored a tombstone that is not recorded yet; it follows as a change
         batch = select_voxels(batch, batch.counts > 0)
         winners = self._change_log.winners(batch.keys)

@@ -17,7 +17,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import VoxelBatch, gather_rows
+from gausslite.domain.voxels import VoxelBatch, find_in, gather_rows
 from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 
 PREFERRED = np.dtype([("keys", "<i8"), ("sources", "<u4"), ("kappa_sums", "<u8")])
@@ -68,9 +68,9 @@ def rank_voxels(table: VoxelScoreTable, preferred: Preferred = _NO_PREFERRED) ->
     keys, kappa_sums, counts = (table.scores[name] for name in ("keys", "kappa_sums", "counts"))
     is_preferred = np.zeros(len(keys), np.bool_)
     if len(preferred):
-        own = preferred.take(np.searchsorted(preferred["keys"], keys), mode="clip")
-        is_own = own["sources"] == source_hashes(table.agents)[table.agent_index]
-        is_preferred = is_own & (own["keys"] == keys) & (own["kappa_sums"] <= kappa_sums)
+        place = find_in(preferred["keys"], keys)
+        is_own = preferred["sources"][place] == source_hashes(table.agents)[table.agent_index]
+        is_preferred = (place >= 0) & is_own & (preferred["kappa_sums"][place] <= kappa_sums)
     # the bitwise complement of an unsigned number sorts it in descending order
     order = np.lexsort((table.agent_index, ~counts, ~kappa_sums, ~is_preferred, keys))
     ranked = table.take(order[counts[order] > 0])  # a tombstone wins nothing

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -19,40 +18,29 @@ _SPLIT_OFFSET = math.sqrt(1.0 - 1.0 / _SPLIT_SHRINK**2)
 """Offset of each half in standard deviations of the parent: the two together keep its mean and covariance."""
 
 
-@dataclass(frozen=True, slots=True)
-class DensityChange:
-    """Numbers of cloned and of split Gaussians; each adds one Gaussian."""
-
-    cloned: int
-    split: int
-
-
-def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> DensityChange:
+def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> None:
     """Clone small and split large Gaussians of high image gradient, within the cap and max_growth.
 
     The Gaussians with the largest gradients have priority. The two children render nearly like their parent, because
     online mapping has no time to repair copies of full opacity and random offsets (Kerbl et al. 2023). They inherit
-    active, kappa, target and anchor, and have no optimiser state. The first half of a split takes the parent's row.
-    Resets the density statistics.
+    active, kappa, target, anchor and the ROI's evidence; their averages are made of the parent's average. A cloned
+    parent keeps its optimiser state; clones and both halves of a split, of which the first takes the parent's row, have
+    none. Resets the density statistics.
     """
     max_added = min(table.free_slots, math.ceil(settings.max_growth * table.count))
     mean_gradient = table.first_moment[:, GRAD_2D_SUM] / np.maximum(table.first_moment[:, GRAD_2D_COUNT], 1.0)
     chosen = _largest_above(mean_gradient, settings.min_mean_gradient, max_added)
     largest_scale_m = np.exp(table.rows[chosen][:, LOG_SCALE].max(axis=1, initial=-np.inf))
     small = largest_scale_m <= settings.percent_dense * extent_m  # 3DGS: small ones lack neighbours, large ones detail
-    to_clone, to_split = chosen[small], chosen[~small]
-    _split(table, to_split)
-    _clone(table, to_clone)
+    _split(table, chosen[~small])
+    _clone(table, chosen[small])
     for statistic in (GRAD_2D_SUM, GRAD_2D_COUNT):
         table.first_moment[:, statistic] = 0.0  # the gradients of before say nothing of the children
-    return DensityChange(cloned=len(to_clone), split=len(to_split))
 
 
-def prune(table: SplatTable, settings: DensitySettings) -> int:
-    """Remove the Gaussians of opacity below `min_opacity`; return their number."""
-    before = table.count
+def prune(table: SplatTable, settings: DensitySettings) -> None:
+    """Remove the Gaussians of opacity below `min_opacity`."""
     table.keep(table.opacities >= settings.min_opacity)
-    return before - table.count
 
 
 def _largest_above(gradient: Float32[ndarray, " n"], threshold: float, max_count: int) -> Int64[ndarray, " m"]:
@@ -70,16 +58,25 @@ def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     for rows in (table.rows, table.ema_rows):
         half_depth = 0.5 * np.logaddexp(0.0, rows[parents, OPACITY_LOGIT].astype(np.float64))  # -log(1 - alpha) / 2
         rows[parents, OPACITY_LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
-    rows = table.rows[parents]
-    rows[:, UPDATE_COUNT] = 0.0
-    table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents], table.anchor[parents])
+    rows, ema_rows = table.rows[parents], table.ema_rows[parents]
+    rows[:, UPDATE_COUNT] = ema_rows[:, UPDATE_COUNT] = 0.0
+    table.append_children(parents, rows, ema_rows)
 
 
 def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     """Replace each parent by two shorter Gaussians, offset along its longest axis."""
-    rows = table.rows[parents]
-    all_rows, longest = np.arange(len(rows)), rows[:, LOG_SCALE].argmax(axis=1)
-    log_scales = rows[:, LOG_SCALE]
+    longest = table.rows[parents, LOG_SCALE].argmax(axis=1)
+    table.rows[parents], second = _halves(table.rows[parents], longest)
+    table.ema_rows[parents], second_ema = _halves(table.ema_rows[parents], longest)
+    table.first_moment[parents] = table.second_moment[parents] = 0.0
+    table.append_children(parents, second, second_ema)
+
+
+def _halves(
+    rows: Float32[ndarray, "m 16"], longest: Int64[ndarray, " m"]
+) -> tuple[Float32[ndarray, "m 16"], Float32[ndarray, "m 16"]]:
+    """Return both halves of each of these rows, without updates. longest: the number of the axis to split."""
+    all_rows, log_scales = np.arange(len(rows)), rows[:, LOG_SCALE]
     offset_m = np.zeros((len(rows), 3), np.float32)
     offset_m[all_rows, longest] = np.float32(_SPLIT_OFFSET) * np.exp(log_scales[all_rows, longest])
     log_scales[all_rows, longest] -= np.float32(math.log(_SPLIT_SHRINK))
@@ -88,11 +85,7 @@ def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     rotated_m = _rotate(rows[:, QUAT], offset_m)
     first[:, MEAN] += rotated_m
     second[:, MEAN] -= rotated_m
-    table.rows[parents] = first
-    table.ema_rows[parents] = first
-    table.first_moment[parents] = 0.0
-    table.second_moment[parents] = 0.0
-    table.append_rows(second, table.active[parents], table.kappa[parents], table.target[parents], table.anchor[parents])
+    return first, second
 
 
 def _rotate(quats_wxyz: Float32[ndarray, "m 4"], vectors: Float32[ndarray, "m 3"]) -> Float32[ndarray, "m 3"]:

@@ -121,7 +121,7 @@ class SplatTable:
 
     @property
     def ema_rows(self) -> Float32[ndarray, "n 16"]:
-        """Exponential moving average (EMA) of the rows at the last `update_ema`; of a new Gaussian, its row."""
+        """Exponential moving average (EMA) of the rows at the last `update_ema`; of a seed, its row."""
         return self._columns["ema_rows"][: self.count]
 
     @property
@@ -143,7 +143,7 @@ class SplatTable:
     def roi_evidence(self) -> Int16[ndarray, " n"]:
         """Number of views with the Gaussian inside the current ROI minus number of views with it outside.
 
-        A new Gaussian starts at 1 if active, else at -1.
+        A new Gaussian starts at 1 if active, else at -1; a clone or half has its parent's.
         """
         return self._columns["roi_evidence"][: self.count]
 
@@ -210,6 +210,17 @@ class SplatTable:
         self._put(place, rows, active, kappa, target)
         self._columns["anchor"][place] = anchor
         self.count += len(rows)
+
+    def append_children(
+        self, parents: Int64[ndarray, " m"], rows: Float32[ndarray, "m 16"], ema_rows: Float32[ndarray, "m 16"]
+    ) -> None:
+        """Add encoded rows and their averages, with the other columns of their parents and zero optimiser state.
+
+        Raises QuotaError if they do not fit.
+        """
+        place = slice(self.count, self.count + len(rows))
+        self.append_rows(rows, self.active[parents], self.kappa[parents], self.target[parents], self.anchor[parents])
+        self.ema_rows[place], self.roi_evidence[place] = ema_rows, self.roi_evidence[parents]
 
     def replace(self, ids: Int[ndarray, " m"], gaussians: Gaussians, anchor: int = NO_ANCHOR) -> None:
         """Overwrite the Gaussians `ids` with these, with zero optimiser state."""

@@ -1,7 +1,7 @@
 """Change the task of a growing map: clear the active flags and set them again from re-evaluated keyframes.
 
 The paper leaves task changes open (Sec. V). A Gaussian becomes active if more views show it, unoccluded, inside the new
-ROI than outside. It keeps its kappa: kappa counts its active-phase iterations for any task.
+ROI than outside. It keeps its kappa: kappa counts its steps in the active phase for any task.
 """
 
 from __future__ import annotations

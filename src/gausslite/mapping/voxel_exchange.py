@@ -11,7 +11,7 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
 from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
-from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelIndex, merge_batches, select_voxels, tombstones
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelIndex, find_in, merge_batches, select_voxels, tombstones
 from gausslite.mapping.pager import MapPager
 from gausslite.mapping.splat_table import SplatTable
 
@@ -140,7 +140,5 @@ def _fits(
 
 def _lookup(keys: Int64[ndarray, " l"], values: ndarray, wanted: Int64[ndarray, " v"]) -> ndarray:
     """Return the value of each wanted key; 0 for a key that is absent."""
-    if len(keys) == 0:
-        return np.zeros(len(wanted), values.dtype)
-    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[place] == wanted, values[place], values.dtype.type(0))
+    found: ndarray = np.append(values, values.dtype.type(0))[find_in(keys, wanted)]
+    return found

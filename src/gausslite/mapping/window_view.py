@@ -13,14 +13,12 @@ from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.pose import inverse
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.settings import KeyframeSettings
-from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subset, TrainingView
+from gausslite.render.rasterizer import TILE_PX, Rasterizer, Subset, TrainingView, reduced_dilation_px2
 
 _ROI_MARGIN_PX = 5
 """Margin around the ROI within which tiles are rendered in the active phase: SSIM's window needs it."""
 _SSIM_WINDOW_PX = 11
 _ALL_MEASURED = 0.999
-_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
-"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +66,7 @@ def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Raste
     # a mean with an unmeasured pixel would be too near
     halved_m = np.where(measured > _ALL_MEASURED, halved_m, np.float32(0.0))
     camera = frame.camera.resized(width, height)
-    return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, _HALF_SIZE_DILATION_PX2)
+    return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, reduced_dilation_px2(2.0))
 
 
 def roi_weights(

@@ -15,7 +15,7 @@ from numpy import ndarray
 from gausslite.domain.camera import back_project, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
+from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid, find_in
 from gausslite.perception.detector import bounding_box
 
 VOXEL_SIZES_M: tuple[float, ...] = (0.00625, 0.0125, 0.025)
@@ -78,10 +78,8 @@ def is_in_large_part(points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, 
 def _parts(keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
     """Return the number of the connected part of each cell: the smallest row spreads until nothing changes."""
     neighbours = keys[:, None] + NEIGHBOUR_OFFSETS
-    position = np.minimum(np.searchsorted(keys, neighbours), len(keys) - 1)
-    own = np.arange(len(keys))[:, None]
-    rows = np.where(keys[position] == neighbours, position, own)
-    part = np.arange(len(keys))
+    rows, part = find_in(keys, neighbours), np.arange(len(keys))
+    rows = np.where(rows >= 0, rows, part[:, None])
     while True:
         spread = part[rows].min(axis=1)
         spread = spread[spread]  # a cell also takes what its smallest row has found: far fewer rounds
@@ -193,7 +191,7 @@ class SurfaceVotes:
 
     def is_on_surface(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Return True for points in a voxel of the object's surface."""
-        return _is_member(self._grid.keys(points_m.astype(np.float32)), self.surface_keys)
+        return find_in(self.surface_keys, self._grid.keys(points_m.astype(np.float32))) >= 0
 
     @property
     def _grid(self) -> VoxelGrid:
@@ -228,10 +226,10 @@ class SurfaceVotes:
     ) -> Bool[ndarray, " n"]:
         """Return True for points in an own voxel without a neighbour among the others."""
         keys, voxel = np.unique(self._grid.keys(points_m.astype(np.float32)), return_inverse=True)
-        is_far = _is_member(keys, own)
+        is_far = find_in(own, keys) >= 0
         rows = np.flatnonzero(is_far)
-        near = (keys[rows, None] + NEIGHBOUR_OFFSETS).reshape(-1)
-        is_far[rows] = ~_is_member(near, others).reshape(len(rows), len(NEIGHBOUR_OFFSETS)).any(axis=1)
+        near = keys[rows, None] + NEIGHBOUR_OFFSETS
+        is_far[rows] = (find_in(others, near) < 0).all(axis=1)
         result: Bool[ndarray, " n"] = is_far[voxel]
         return result
 
@@ -257,7 +255,7 @@ class SurfaceVotes:
     def surface_keys(self) -> Int64[ndarray, " m"]:
         """The keys of the surface's voxels, ascending."""
         near = np.unique((self._inside_keys[:, None] + NEIGHBOUR_OFFSETS).reshape(-1))
-        keys: Int64[ndarray, " m"] = near[~_is_member(near, self._outside_keys)]
+        keys: Int64[ndarray, " m"] = near[find_in(self._outside_keys, near) < 0]
         return keys
 
     @cached_property
@@ -300,14 +298,6 @@ def _planes(points_m: Float64[ndarray, "n 3"], limits_m: _Limits) -> list[Float6
         planes.append(np.append(normals[best], offsets_m[best]))
         points_m, near_m = points_m[~is_near[:, best]], near_m[~is_near[:, best]]
     return planes
-
-
-def _is_member(keys: Int64[ndarray, " n"], ascending: Int64[ndarray, " m"]) -> Bool[ndarray, " n"]:
-    if len(ascending) == 0:
-        return np.zeros(len(keys), np.bool_)
-    position = np.minimum(np.searchsorted(ascending, keys), len(ascending) - 1)
-    result: Bool[ndarray, " n"] = ascending[position] == keys
-    return result
 
 
 def snapped_to_edges(mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:

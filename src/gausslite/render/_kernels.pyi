@@ -79,6 +79,7 @@ class Engine:
         tiles: Bool[ndarray, "th tw"] | None,
         ids: UInt32[ndarray, " m"] | None,
         motion: list[float] | None,
+        dilation_px2: float,
     ) -> tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"], Float32[ndarray, "h w"], int]:
         """Return rgb, depth_m, alpha and the frame number.
 

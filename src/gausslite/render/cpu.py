@@ -297,6 +297,7 @@ class CpuRasterizer:
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
         require_table("rows", rows)
@@ -310,7 +311,8 @@ class CpuRasterizer:
                 T_camera_world,
                 contiguous(subset.tiles),
                 contiguous(subset.ids),
-                native_motion(motion),
+                motion=native_motion(motion),
+                dilation_px2=dilation_px2,
             )
         return Rendering(rgb, depth_m, alpha, _ForwardContext(self, frame, rows, T_camera_world))
 

@@ -8,7 +8,7 @@ since the last densification. Column 14: norms of the gradient with respect to t
 heights (as in 3DGS). Column 15: number of steps in which the splat was visible.
 
 Image model (EWA splatting; 3DGS, Kerbl et al. 2023; Sec. III-A):
-    - The diagonal of the 2D covariance gets 0.3 px² (`DILATION_PX2`), or what a training view states.
+    - The diagonal of the 2D covariance gets `dilation_px2`, 0.3 px² by default.
     - Contributions with alpha < 1/255 are dropped. Alpha is clamped to 0.99, without a gradient through the clamp.
     - Splats nearer than 0.05 m are culled. The others are blended in ascending order of z.
     - The tangent x/z, y/z in the Jacobian is clamped to 1.3 times half the field of view.
@@ -64,8 +64,6 @@ NEAR_M, DILATION_PX2 = 0.05, 0.3
 MIN_ALPHA = 1.0 / 255.0
 TANGENT_MARGIN = 1.3
 """Limit of the tangents in the Jacobian, as a factor of half the field of view."""
-MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
-"""Limits of a moving camera's exposure time, in readouts, and of 1 - s readout / height."""
 _MIN_SCALE_M = 1e-7
 _MIN_OPACITY = 1e-6
 
@@ -230,8 +228,9 @@ class Rasterizer(Protocol):
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> Rendering:
-        """Render the splats, with a moving camera if motion is given.
+        """Render the splats, with a moving camera if motion is given. dilation_px2: in (0, 1).
 
         Raises ShapeError, InvalidInputError if the ids are not ascending row numbers.
         """
@@ -298,6 +297,14 @@ class Rasterizer(Protocol):
         Without a binding, each step copies the tables to the device and back.
         Raises ShapeError, InvalidInputError if tables are bound already.
         """
+
+
+def reduced_dilation_px2(factor: float) -> float:
+    """Return the dilation with which splats look as in the full image averaged over factor x factor pixels.
+
+    Averaging adds the variance of a box without that of the full image's pixels: (factor² - 1) / 12 px².
+    """
+    return (DILATION_PX2 + (factor**2 - 1.0) / 12.0) / factor**2
 
 
 def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = None) -> None:

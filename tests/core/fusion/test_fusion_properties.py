@@ -2,6 +2,7 @@
 
 import itertools
 import tempfile
+import tracemalloc
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -172,6 +173,17 @@ def test_the_winner_has_the_highest_kappa_sum_then_more_gaussians_then_the_lower
     for key, (_, _, agent_id) in expected.items():
         keys = np.array([key], np.int64)
         assert_same_batch(select_keys(fused.batch, keys), select_keys(table[agent_id], keys))
+
+
+def test_a_few_voxels_of_a_large_map_are_read_without_a_copy_of_its_keys() -> None:
+    gaussians = gaussians_in([(cell, 1) for cell in range(50_000)], seed=0)
+    batch = group_by_voxel(gaussians, GRID)
+    tracemalloc.start()
+    try:
+        assert len(select_keys(batch, np.append(batch.keys[::5000], batch.keys[-1] + 1))) == 10
+        assert tracemalloc.get_traced_memory()[1] < batch.keys.nbytes / 4
+    finally:
+        tracemalloc.stop()
 
 
 @few_examples

@@ -1,5 +1,7 @@
 """The page of a fusion server: the fused map with each Gaussian's agent and object, and one agent's own map."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +31,18 @@ from gausslite_view.fusion_panel import FusionPanel
 WAIT_S = 60.0
 
 
+@contextmanager
+def opened_page(running: RunningServer) -> Iterator[tuple[SeenPage, FusionPanel]]:
+    """Yield the server's page and its panel, which has its own client."""
+    page, client = SeenPage(), FusionClient(running.client.address)
+    panel = FusionPanel(page, client, ServerMemory(client.address))
+    try:
+        yield page, panel
+    finally:
+        panel.close()
+        page.close()
+
+
 def contribute(running: RunningServer, agent_id: str, task: str, cells_m: list[float], kappa: int) -> None:
     """Send one Gaussian, of the task's first target, at each place along x."""
     means_m = [[x + 0.05, 0.05, 0.05] for x in cells_m]
@@ -41,10 +55,8 @@ def contribute(running: RunningServer, agent_id: str, task: str, cells_m: list[f
 def test_the_page_shows_who_won_each_voxel_and_what_it_shows(fusion: RunningServer):
     contribute(fusion, "a", "Pick up the mug", [0.0, 1.0], kappa=5)
     contribute(fusion, "b", "Find the chair", [1.0, 2.0], kappa=9)
-    page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client, ServerMemory(client.address))
-    try:
-        client.keep_session(client.join("c", GRID).session_id, "lost")
+    with opened_page(fusion) as (page, panel):
+        fusion.client.keep_session(fusion.client.join("c", GRID).session_id, "lost")
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 3)
         assert text(page).count("; the robot is lost") == 1
         fused = page.contents
@@ -57,9 +69,6 @@ def test_the_page_shows_who_won_each_voxel_and_what_it_shows(fusion: RunningServ
         own = page.contents
         np.testing.assert_allclose(np.sort(own.gaussians.means_m[:, 0]), [0.05, 1.05], atol=0.01)
         assert (own.agents, own.targets) == (("a",), ("mug",))
-    finally:
-        panel.close()
-        page.close()
 
 
 def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one(fusion: RunningServer):
@@ -67,9 +76,7 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one(fus
     session = fusion.client.join("a", GRID).session_id
     assert fusion.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)]) == 2
     contribute(fusion, "b", "Find the chair", [1.0], kappa=9)
-    page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client, ServerMemory(client.address))
-    try:
+    with opened_page(fusion) as (page, panel):
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 2)
         (shown,) = images(page)
         assert shown.label.startswith("a: keyframe 8")
@@ -79,9 +86,6 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one(fus
         control(page, "Keyframes back").value = 1
         panel.poll()
         assert shown.label.startswith("a: keyframe 3")
-    finally:
-        panel.close()
-        page.close()
 
 
 def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality(fusion: RunningServer, monkeypatch):
@@ -92,9 +96,7 @@ def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality(fu
     contribute(fusion, "b", "Find the chair", [1.0], kappa=9)
     session_b = fusion.client.join("b", GRID).session_id
     fusion.client.contribute_keyframes(session_b, [coloured_frame(5, 90)])
-    page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client, ServerMemory(client.address))
-    try:
+    with opened_page(fusion) as (page, panel):
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == len(wall().gaussians) + 1)
         poll_until(panel.poll, lambda: len(page.contents.paths[0].keyframes) == 20)
         a, b = page.contents.paths
@@ -110,18 +112,13 @@ def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality(fu
         assert plot(page, "received (kB/s)").keys() == {"s", "a", "b"}
         control(page, "Trajectory").value = False
         assert node("/team/a/line") is None
-    finally:
-        panel.close()
-        page.close()
 
 
 def test_the_time_slider_shows_the_earlier_fused_map_and_keyframe(fusion: RunningServer):
     contribute(fusion, "a", "Pick up the mug", [0.0], kappa=5)
     session = fusion.client.join("a", GRID).session_id
     assert fusion.client.contribute_keyframes(session, [coloured_frame(3, 40)]) == 1
-    page, client = SeenPage(), FusionClient(fusion.client.address)
-    panel = FusionPanel(page, client, ServerMemory(client.address))
-    try:
+    with opened_page(fusion) as (page, panel):
         poll_until(panel.poll, lambda: len(page.contents.gaussians) == 1)
         contribute(fusion, "b", "Find the chair", [1.0, 2.0], kappa=9)
         assert fusion.client.contribute_keyframes(session, [coloured_frame(8, 200)]) == 1
@@ -136,9 +133,6 @@ def test_the_time_slider_shows_the_earlier_fused_map_and_keyframe(fusion: Runnin
         seconds.value = seconds.max
         assert shown.label.startswith("a: keyframe 8")
         assert abs(int(shown.image.mean()) - 200) < 3
-    finally:
-        panel.close()
-        page.close()
 
 
 def test_a_region_of_another_size_is_refused(fusion: RunningServer):
@@ -224,12 +218,7 @@ def coloured_frame(index: int, grey: int) -> Frame:
 
 
 def test_a_refused_refinement_is_reported_on_the_page(fusion: RunningServer):
-    page = SeenPage()
-    panel = FusionPanel(page, FusionClient(fusion.client.address), ServerMemory(fusion.client.address))
-    try:
+    with opened_page(fusion) as (page, panel):
         panel.refine()
         assert "refinement: expected a fused map and keyframes, got 0 Gaussians" in text(page)
         assert not control(page, "Start refinement").disabled
-    finally:
-        panel.close()
-        page.close()

@@ -227,9 +227,10 @@ class ReferenceRasterizer:
         T_camera_world: Float64[ndarray, "4 4"],
         subset: Subset = FULL_FRAME,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
-        graph = _render(rows, ImageModel.of(camera, motion), T_camera_world, subset)
+        graph = _render(rows, ImageModel.of(camera, motion, dilation_px2), T_camera_world, subset)
         images = graph.images.numpy().astype(np.float32)
         return Rendering(
             np.ascontiguousarray(images[..., :3]),
