@@ -188,26 +188,23 @@ struct StepTraining {
   LossWeights loss;
   AdamOptions adam;
   bool masked;
-  std::optional<Flags> trainable;
   std::optional<Counts> update_counts;
   std::optional<Flags> count_mask;
   uint64_t binding_id;
 
   StepTraining(std::tuple<RowTable, RowTable, RowTable> tables, std::tuple<float, float, float, bool> weights,
                const std::vector<float>& rates, std::tuple<double, double, double, double> constants, bool masked,
-               std::optional<Flags> trainable, std::optional<Counts> update_counts, std::optional<Flags> count_mask,
-               uint64_t binding_id)
+               std::optional<Counts> update_counts, std::optional<Flags> count_mask, uint64_t binding_id)
       : rows(std::get<0>(tables)),
         first_moment(std::get<1>(tables)),
         second_moment(std::get<2>(tables)),
         loss{std::get<0>(weights), std::get<1>(weights), std::get<2>(weights), std::get<3>(weights)},
         masked(masked),
-        trainable(trainable),
         update_counts(update_counts),
         count_mask(count_mask),
         binding_id(binding_id) {
     const size_t n = rows.shape(0);
-    require(first_moment.shape(0) == n && second_moment.shape(0) == n && (!trainable || trainable->shape(0) == n) &&
+    require(first_moment.shape(0) == n && second_moment.shape(0) == n &&
                 (!update_counts || update_counts->shape(0) == n) && (!count_mask || count_mask->shape(0) == n),
             "tables: lengths disagree");
     require(rates.size() == 16, "rates: expected 16");
@@ -222,7 +219,6 @@ struct StepTraining {
     return {rows.data(),
             first_moment.data(),
             second_moment.data(),
-            flags(trainable),
             update_counts ? update_counts->data() : nullptr,
             flags(count_mask),
             binding_id};
@@ -271,12 +267,12 @@ NB_MODULE(_kernels, m) {
            nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(), nb::arg("motion").none(),
            nb::arg("dilation_px2"));
 
-  nb::class_<StepTraining>(m, "StepTraining", "Tables, settings and masks of a step; references the arrays.")
+  nb::class_<StepTraining>(m, "StepTraining", "Tables, settings and counter of a step; references the arrays.")
       .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float, bool>,
-                    const std::vector<float>&, std::tuple<double, double, double, double>, bool, std::optional<Flags>,
+                    const std::vector<float>&, std::tuple<double, double, double, double>, bool,
                     std::optional<Counts>, std::optional<Flags>, uint64_t>(),
            nb::arg("tables").noconvert(), nb::arg("loss"), nb::arg("rates"), nb::arg("adam"), nb::arg("masked"),
-           nb::arg("trainable").noconvert().none(), nb::arg("update_counts").noconvert().none(),
+           nb::arg("update_counts").noconvert().none(),
            nb::arg("count_mask").noconvert().none(), nb::arg("binding_id"));
 
   nb::class_<Rasterizer>(m, "Engine", "Scratch memory and a thread pool; it does not own the splats.")

@@ -245,7 +245,7 @@ double Rasterizer::step(const FrameInput& input, const OptimizerState& state, co
   const TrainingArguments training = begin_training(view, masked, loss);
   const bool with_ssim = loss.ssim != 0.0f;
   UpdateArguments update{
-      state.rows, state.first_moment, state.second_moment, state.trainable, state.update_counts, state.count_mask, {}};
+      state.rows, state.first_moment, state.second_moment, state.update_counts, state.count_mask, {}};
   std::copy_n(adam.rates, 16, update.adam.rates);
   update.adam.beta1 = float(adam.beta1);
   update.adam.beta2 = float(adam.beta2);

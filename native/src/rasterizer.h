@@ -33,7 +33,6 @@ struct OptimizerState {
   float* rows;
   float* first_moment;
   float* second_moment;
-  const uint8_t* trainable;  // null: all
   uint32_t* update_counts;   // as in UpdateArguments
   const uint8_t* count_mask;
   // Number of the table binding: only steps change the rows of bound tables. 0: not bound, other code may change them.

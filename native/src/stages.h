@@ -73,7 +73,6 @@ struct UpdateArguments {
   float* rows;
   float* first_moment;
   float* second_moment;
-  const uint8_t* trainable;   // null: all
   uint32_t* update_counts;    // incremented for each changed row that count_mask selects; null: no counts
   const uint8_t* count_mask;  // null: all
   AdamSettings adam;

@@ -138,7 +138,6 @@ void update_splats(Workspace& ws, const UpdateArguments& args, int thread) {
       const uint32_t id = group.id[j];
       // Spread the prefetches over the updates: a core has about two dozen outstanding cache lines.
       prefetch_splat(ws.visible[slots.next(j)]);
-      if (args.trainable != nullptr && !args.trainable[id]) continue;
       adam.step(id, g.column[j]);
       if (ws.stores_bounds) store_row_bounds(ws, id, args.rows + size_t(kRowWidth) * id);
       if (args.update_counts != nullptr && (args.count_mask == nullptr || args.count_mask[id]))

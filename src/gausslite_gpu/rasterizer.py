@@ -25,8 +25,8 @@ from gausslite.render.rasterizer import (
     Subset,
     TrainingView,
     UpdateCounter,
+    require_counter,
     require_image_gradients,
-    require_row_masks,
     require_scene,
     require_table,
     require_tables,
@@ -184,7 +184,6 @@ class CudaRasterizer:
         adam: AdamSettings,
         masked: bool = False,
         subset: Subset = FULL_FRAME,
-        trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """Run one training iteration on the device; unbound tables are copied there and back.
@@ -204,21 +203,17 @@ class CudaRasterizer:
                     adam=adam,
                     masked=masked,
                     subset=subset,
-                    trainable=trainable,
                     update_counter=update_counter,
                 )
         if not self._bound.host.same_memory_as(tables):
             raise InvalidInputError("step: expected the bound tables, got others")
         require_scene(len(rows), view.camera, T_camera_world, subset)
-        require_row_masks(len(rows), trainable, update_counter)
+        require_counter(len(rows), update_counter)
         target = view.masked if masked else view.unmasked
         graph = self._render(self._bound.rows, view.device_camera, T_camera_world, subset, target.window)
         value = training_loss(graph.channels, graph.alpha, target, loss)
         gradients, d_means_px = torch.autograd.grad(value, (graph.rows, graph.means_px))
         row_ids, norms = graph.visible, _norms_2d(d_means_px, view.device_camera)
-        if trainable is not None:
-            updated = torch.nonzero(to_device(trainable, row_ids.device)[row_ids])[:, 0]
-            row_ids, gradients, norms = row_ids[updated], gradients[updated], norms[updated]
         self._bound.update(row_ids, gradients, norms, adam)
         if update_counter is not None:
             self._bound.count(row_ids, update_counter)

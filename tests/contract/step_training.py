@@ -58,14 +58,13 @@ def train(
     loss: LossWeights = LOSS,
     masked: bool = False,
     subset: Subset = FULL_FRAME,
-    trainable: np.ndarray | None = None,
     with_history: bool = False,
     adam: AdamSettings = ADAM,
 ) -> StepResult:
     before = tables(scene, with_history)
     rows, first, second = (table.copy() for table in before)
     view = target.view(rasterizer, scene)
-    report = rasterizer.step(rows, first, second, view, scene.T_camera_world, loss, adam, masked, subset, trainable)
+    report = rasterizer.step(rows, first, second, view, scene.T_camera_world, loss, adam, masked, subset)
     return StepResult(before, rows, first, second, report)
 
 

@@ -1,4 +1,4 @@
-"""Contract of the training step: forward, loss, backward and Adam on visible, trainable rows."""
+"""Contract of the training step: forward, loss, backward and Adam on visible rows."""
 
 import math
 from dataclasses import replace

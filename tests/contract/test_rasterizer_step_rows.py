@@ -1,4 +1,4 @@
-"""A step changes only visible, trainable rows, counts their updates, and rejects invalid tables."""
+"""A step changes only visible rows, counts their updates, and rejects invalid tables."""
 
 from dataclasses import replace
 
@@ -20,43 +20,23 @@ def test_invisible_rows_are_unchanged(rasterizer: Rasterizer, oracle: Rasterizer
         np.testing.assert_array_equal(after[hidden], before[hidden])
 
 
-def test_frozen_rows_are_unchanged_and_others_train_as_before(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
-    scene = named_scene("medium splats")
-    target = target_for(scene, oracle)
-    trainable = np.random.default_rng(5).random(len(scene.rows)) < 0.5
-    free = train(rasterizer, scene, target, with_history=True)
-    frozen = train(rasterizer, scene, target, trainable=trainable, with_history=True)
-    np.testing.assert_array_equal(frozen.report.visible, free.report.visible)
-    for after, before, free_table in zip(
-        (frozen.rows, frozen.first_moment, frozen.second_moment),
-        frozen.before,
-        (free.rows, free.first_moment, free.second_moment),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(after[~trainable], before[~trainable])
-        assert relative_error(after[trainable], free_table[trainable]) < 1e-4
-
-
 def test_update_counter_counts_changed_rows(rasterizer: Rasterizer, oracle: Rasterizer) -> None:
     scene = named_scene("medium splats")
     view = target_for(scene, oracle).view(rasterizer, scene)
     bound, rng = tables(scene, with_history=False), np.random.default_rng(6)
-    trainable, mask = rng.random((2, len(scene.rows))) < 0.5
+    mask = rng.random(len(scene.rows)) < 0.5
     all_counter, masked_counter = (
         UpdateCounter(np.full(len(scene.rows), 7, np.uint32), selection) for selection in (None, mask)
     )
     with rasterizer.bind_tables(*bound):
         for step in range(10):
-            rasterizer.step(
-                *bound, view, scene.T_camera_world, LOSS, ADAM, trainable=trainable, update_counter=all_counter
-            )
+            rasterizer.step(*bound, view, scene.T_camera_world, LOSS, ADAM, update_counter=all_counter)
             if step < 3:
                 rasterizer.step(*bound, view, scene.T_camera_world, LOSS, ADAM, update_counter=masked_counter)
     trained = bound[0][:, UPDATE_COUNT]
     np.testing.assert_array_equal(masked_counter.counts[~mask], 7)
     assert set(masked_counter.counts[mask]) == {7, 10}
-    np.testing.assert_array_equal(all_counter.counts[~trainable], 7)
-    np.testing.assert_array_equal((all_counter.counts - 7 + 3 * (trained > 0))[trainable], trained[trainable])
+    np.testing.assert_array_equal(all_counter.counts - 7 + 3 * (trained > 0), trained)
 
 
 def test_second_binding_is_rejected(rasterizer: Rasterizer) -> None:

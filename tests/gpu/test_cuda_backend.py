@@ -134,12 +134,12 @@ def test_missing_device_is_named() -> None:
 
 def test_read_only_inputs_are_accepted() -> None:
     rasterizer, frame = CudaRasterizer(TorchKernels()), wall_frame(0, SIZE)
-    bound, rgb, trainable = tables(), frame.rgb.copy(), np.ones(4, np.bool_)
+    bound, rgb = tables(), frame.rgb.copy()
     tiles = np.ones((1, 2), np.bool_)
     rows = bound[0].copy()
-    for array in (rgb, trainable, tiles, rows):
+    for array in (rgb, tiles, rows):
         array.flags.writeable = False
     rasterizer.forward(rows, frame.camera, np.eye(4), Subset(tiles=tiles))
     view = rasterizer.prepare_view(rgb, frame.depth_m, frame.camera)
-    report = rasterizer.step(*bound, view, np.eye(4), LossWeights(), AdamSettings(), trainable=trainable)
+    report = rasterizer.step(*bound, view, np.eye(4), LossWeights(), AdamSettings())
     assert len(report.visible) == 4

@@ -46,8 +46,6 @@ class ActivePhase(StrEnum):
 
     ALL_GAUSSIANS = "all-gaussians"
     """Render and update all Gaussians in the ROI's tiles, active or not."""
-    FROZEN_BACKGROUND = "frozen-background"
-    """Render all Gaussians in the ROI's tiles, but update only the active ones."""
     ACTIVE_ONLY = "active-only"
     """Render and update active Gaussians only (Sec. III-D.1): cheaper, but no background occludes the ROI's border."""
 

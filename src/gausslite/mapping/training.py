@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt32
+from jaxtyping import Float32, UInt32
 from numpy import ndarray
 
 from gausslite.domain.errors import MapFileError
@@ -113,11 +113,10 @@ class RegionSaturation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Binding:
-    """The arrays that the rasterizer trains on until rows move: Adam's tables and the active phase's row masks."""
+    """The arrays that the rasterizer trains on until rows move: Adam's tables and the active phase's rows."""
 
     tables: _Tables
     active_ids: UInt32[ndarray, " m"] | None
-    trainable: Bool[ndarray, " n"] | None
     kappa_counter: UpdateCounter
 
     @classmethod
@@ -126,7 +125,6 @@ class _Binding:
         return cls(
             tables=(table.rows, table.first_moment, table.second_moment),
             active_ids=np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None,
-            trainable=table.active if phase is ActivePhase.FROZEN_BACKGROUND else None,
             kappa_counter=UpdateCounter(table.kappa, table.active),
         )
 
@@ -320,7 +318,6 @@ class Trainer:
             self._adam,
             masked=True,
             subset=view.roi if binding.active_ids is None else Subset(view.roi.tiles, binding.active_ids),
-            trainable=binding.trainable,
             update_counter=binding.kappa_counter,  # κ: only here, in the active phase
         )
         if self._saturation.enabled:

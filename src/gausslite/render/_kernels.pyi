@@ -40,7 +40,7 @@ class StepScene:
     ) -> None: ...
 
 class StepTraining:
-    """Tables, settings and masks of a step; references the arrays."""
+    """Tables, settings and counter of a step; references the arrays."""
 
     def __init__(
         self,
@@ -49,7 +49,6 @@ class StepTraining:
         rates: Sequence[float],
         adam: tuple[float, float, float, float],
         masked: bool,
-        trainable: Bool[ndarray, " n"] | None,
         update_counts: UInt32[ndarray, " n"] | None,
         count_mask: Bool[ndarray, " n"] | None,
         binding_id: int,

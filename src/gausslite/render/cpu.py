@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 from weakref import ref
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from jaxtyping import Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, CameraMotion
@@ -32,8 +32,8 @@ from gausslite.render.rasterizer import (
     Subset,
     TrainingView,
     UpdateCounter,
+    require_counter,
     require_image_gradients,
-    require_row_masks,
     require_scene,
     require_table,
     require_tables,
@@ -174,33 +174,31 @@ class TableBinding:
         tables: _Tables,
         settings: tuple[LossWeights, AdamSettings],
         masked: bool,
-        trainable: Bool[ndarray, " n"] | None,
         update_counter: UpdateCounter | None,
     ) -> _kernels.StepTraining:
-        """Return the native form of tables, settings, masks and counter. Raises ShapeError."""
-        arguments, cached = (*tables, *settings, trainable, update_counter), self._trainings.get(masked)
+        """Return the native form of tables, settings and counter. Raises ShapeError."""
+        arguments, cached = (*tables, *settings, update_counter), self._trainings.get(masked)
         if cached is not None and cached.matches(arguments):
             return cached.native
         is_bound = self._tables is not None and all(map(is_, tables, self._tables))
         if not is_bound:
             require_tables(*tables)
-        require_row_masks(len(tables[0]), trainable, update_counter)
+        require_counter(len(tables[0]), update_counter)
         loss, adam = settings
         counts = None if update_counter is None else update_counter.counts
         mask = None if update_counter is None else update_counter.mask
-        flags, mask_flags = contiguous(trainable), contiguous(mask)
+        mask_flags = contiguous(mask)
         native: _kernels.StepTraining = load_kernels().StepTraining(
             tables=tables,
             loss=(loss.colour, loss.depth, loss.ssim, loss.normalise_by_image),
             rates=_row_rates(adam),
             adam=(adam.beta1, adam.beta2, adam.epsilon, adam.decay_after_updates),
             masked=masked,
-            trainable=flags,
             update_counts=counts,
             count_mask=mask_flags,
             binding_id=self._binding_id if is_bound else 0,
         )
-        if is_bound and flags is trainable and mask_flags is mask:
+        if is_bound and mask_flags is mask:
             self._trainings[masked] = _CachedArguments(arguments, native)
         return native
 
@@ -372,7 +370,6 @@ class CpuRasterizer:
         adam: AdamSettings,
         masked: bool = False,
         subset: Subset = FULL_FRAME,
-        trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """Run one training iteration in place. Raises ShapeError, also for a view of another backend."""
@@ -381,7 +378,7 @@ class CpuRasterizer:
         with self._lock:
             scene = view.scene(len(rows), T_camera_world, subset, masked)
             tables = rows, first_moment, second_moment
-            training = self._binding.training(tables, (loss, adam), masked, trainable, update_counter)
+            training = self._binding.training(tables, (loss, adam), masked, update_counter)
             self._fetch_visible_rows()
             report = _Report(self._engine.step(scene, training), self._engine, self._lock)
             self._latest = ref(report)

@@ -210,7 +210,7 @@ class StepReport(Protocol):
 
     @property
     def visible(self) -> UInt32[ndarray, " m"]:
-        """The visible rows, ascending, trainable or not."""
+        """The visible rows, ascending."""
 
 
 @runtime_checkable
@@ -274,14 +274,12 @@ class Rasterizer(Protocol):
         adam: AdamSettings,
         masked: bool = False,
         subset: Subset = FULL_FRAME,
-        trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """Run one training iteration in place: forward, loss, backward and sparse Adam.
 
-        Only rows that are visible and trainable (None: all) change, and their moments. Column UPDATE_COUNT, the density
-        statistics and update_counter change for the same rows. masked=True weights the loss by the view's weight.
-        Raises ShapeError, InvalidInputError.
+        Only visible rows and their moments change, column UPDATE_COUNT, the density statistics and update_counter for
+        the same rows. masked=True weights the loss by the view's weight. Raises ShapeError, InvalidInputError.
         """
 
     def bind_tables(
@@ -336,10 +334,8 @@ def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"
             raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
 
 
-def require_row_masks(n: int, trainable: Bool[ndarray, " n"] | None, update_counter: UpdateCounter | None) -> None:
-    """Raise ShapeError unless masks and counters have length n and the counters are writeable."""
-    if trainable is not None:
-        require_array("trainable", trainable, (n,), np.bool_)
+def require_counter(n: int, update_counter: UpdateCounter | None) -> None:
+    """Raise ShapeError unless counters and mask have length n and the counters are writeable."""
     if update_counter is None:
         return
     require_array("update_counter counts", update_counter.counts, (n,), np.uint32)

@@ -40,7 +40,6 @@ def train(rasterizer: CpuRasterizer, bind: bool, loss: LossWeights) -> list[np.n
     rows = random_rows(5000)
     bound = rows, np.zeros_like(rows), np.zeros_like(rows)
     subset_ids = np.arange(0, len(rows), 3, dtype=np.uint32)
-    trainable = rng.random(len(rows)) < 0.5
     visible = []
     for _ in range(2):
         with rasterizer.bind_tables(*bound) if bind else nullcontext():
@@ -51,9 +50,7 @@ def train(rasterizer: CpuRasterizer, bind: bool, loss: LossWeights) -> list[np.n
                     Subset(scattered_tiles(i)),
                     Subset(scattered_tiles(i), subset_ids),
                 )[i % 4]
-                report = rasterizer.step(
-                    *bound, view, pose(0.3 * i), loss, FAST, i % 2 == 1, subset, trainable if i % 5 == 0 else None
-                )
+                report = rasterizer.step(*bound, view, pose(0.3 * i), loss, FAST, i % 2 == 1, subset)
                 visible.append(report.visible)
         rows[::2, :3] = rows[::2, 2::-1]
     return [*bound, *visible]
@@ -79,7 +76,7 @@ def test_cached_arguments_follow_changes_of_their_arrays(masked: bool) -> None:
     for fresh in (False, True):
         rows = random_rows(800)
         bound = rows, np.zeros_like(rows), np.zeros_like(rows)
-        counts, mask, trainable = np.zeros(800, np.uint32), np.ones(800, bool), np.ones(800, bool)
+        counts, mask = np.zeros(800, np.uint32), np.ones(800, bool)
         T_camera_world, update_counter = np.eye(4), UpdateCounter(counts, mask)
         subset = Subset(np.ones((6, 7), bool))
         assert subset.tiles is not None
@@ -87,13 +84,12 @@ def test_cached_arguments_follow_changes_of_their_arrays(masked: bool) -> None:
             for i in range(6):
                 T_camera_world[:] = pose(0.3 * i)
                 subset.tiles[:] = scattered_tiles(i)
-                trainable[:], mask[:] = np.arange(800) % 3 != i % 3, np.arange(800) % 2 == i % 2
-                arguments = (T_camera_world, subset, trainable, update_counter)
+                mask[:] = np.arange(800) % 2 == i % 2
+                arguments = (T_camera_world, subset, update_counter)
                 if fresh:
                     arguments = (
                         T_camera_world.copy(),
                         Subset(subset.tiles.copy()),
-                        trainable.copy(),
                         UpdateCounter(counts, mask.copy()),
                     )
                 rasterizer.step(*bound, view, arguments[0], LossWeights(), FAST, masked, *arguments[1:])

@@ -30,8 +30,8 @@ from gausslite.render.rasterizer import (
     Subset,
     TrainingView,
     UpdateCounter,
+    require_counter,
     require_image_gradients,
-    require_row_masks,
     require_scene,
     require_table,
     require_tables,
@@ -286,29 +286,26 @@ class ReferenceRasterizer:
         adam: AdamSettings,
         masked: bool = False,
         subset: Subset = FULL_FRAME,
-        trainable: Bool[ndarray, " n"] | None = None,
         update_counter: UpdateCounter | None = None,
     ) -> StepReport:
         """Run one training iteration in place. Raises ShapeError, also for a view of another backend."""
         if not isinstance(view, ReferenceView):
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         require_tables(rows, first_moment, second_moment)
-        require_row_masks(len(rows), trainable, update_counter)
+        require_counter(len(rows), update_counter)
         graph = _render(rows, ImageModel.of(view.camera, view.motion, view.dilation_px2), T_camera_world, subset)
         images = graph.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
         (d_images,) = torch.autograd.grad(value, images)
-        d_rows, _, visible, norms = _backward(graph, d_images)
-        updated = np.ones(len(visible), np.bool_) if trainable is None else trainable[visible]
-        row_ids = visible[updated]
+        d_rows, _, row_ids, norms = _backward(graph, d_images)
         _adam(rows, first_moment, second_moment, d_rows, row_ids, adam)
-        first_moment[row_ids, GRAD_2D_SUM] += norms[updated].astype(np.float32)
+        first_moment[row_ids, GRAD_2D_SUM] += norms.astype(np.float32)
         first_moment[row_ids, GRAD_2D_COUNT] += 1.0
         if update_counter is not None:
             update_counter.counts[
                 row_ids if update_counter.mask is None else row_ids[update_counter.mask[row_ids]]
             ] += 1
-        return HostReport(value.item(), visible.astype(np.uint32))
+        return HostReport(value.item(), row_ids.astype(np.uint32))
 
     @contextmanager
     def bind_tables(
