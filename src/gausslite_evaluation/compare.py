@@ -106,12 +106,14 @@ def score_training_views(
 
     The map was trained on them, so it only shows whether the map fits what the camera saw.
     """
+    keyframes = [(frame, roi) for frame, roi in keyframes if frame.has_depth]  # one without is left out as a whole
     pixels = [int(np.count_nonzero(roi)) for _, roi in keyframes]
     in_region, in_images = [], []
     for i in sorted(largest_roi_per_segment(pixels, count)):
         view = HeldOutView(*keyframes[i])
         rgb = render(view.frame).rgb
-        in_images.append(min(psnr(rgb, view.frame.rgb), MAX_PSNR_DB))
+        trained = None if view.frame.left_out is None else ~view.frame.left_out
+        in_images.append(min(psnr(rgb, view.frame.rgb, trained), MAX_PSNR_DB))
         if view.shows_region:
             in_region.append(min(psnr(rgb, view.frame.rgb, view.roi), MAX_PSNR_DB))
     if not in_images:

@@ -155,7 +155,7 @@ def reduced(frame: Frame, width_px: int = _WIDTH_PX) -> Frame:
     size = camera.width_px, camera.height_px
     rgb = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
     depth_m = cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST)
-    return replace(frame, rgb=rgb, depth_m=depth_m, camera=camera, motion=None, recorded_rgb=None)
+    return replace(frame, rgb=rgb, depth_m=depth_m, camera=camera, motion=None, recorded_rgb=None, left_out=None)
 
 
 def _refined(

@@ -78,6 +78,8 @@ def views_of(rows: Float32[ndarray, "n 16"], vote: RefineInput, rasterizer: Rast
         behind_m = np.where(frame.depth_m > 0, frame.depth_m - surface_m, 0.0)
         tolerance_m = _DEPTH_M + _DEPTH_SHARE * surface_m
         explained = (surface_m > 0) & (behind_m >= -tolerance_m)
+        if frame.left_out is not None:
+            explained &= ~frame.left_out
         if not explained.any():
             continue
         difference = np.abs(np.clip(rendering.rgb, 0.0, 1.0) - frame.rgb / np.float32(255.0)).mean(axis=2)

@@ -11,8 +11,9 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import BallRegion
+from gausslite.mission.evaluation import TrainingFit
 from gausslite.render.map_viewer import MapViewer
-from gausslite_evaluation.compare import MAX_PSNR_DB, average, evaluate, score_view
+from gausslite_evaluation.compare import MAX_PSNR_DB, average, evaluate, score_training_views, score_view
 from gausslite_evaluation.metrics import psnr
 from gausslite_evaluation.views import HeldOutView
 
@@ -65,6 +66,9 @@ def test_a_perfect_image_has_a_finite_psnr() -> None:
     rendering = Rendering(frame.rgb / np.float32(255.0), frame.depth_m, np.ones_like(frame.depth_m), None)
     scores = average([score_view(rendering, view_with(frame, 100)), score_view(rendering, view_with(frame, 0))])
     assert scores.roi_psnr == scores.full_psnr == MAX_PSNR_DB
+    left_out = view_with(frame, 400).roi  # a training view's moving thing, which no map shows
+    seen = replace(frame, rgb=np.where(left_out[..., None], 255 - frame.rgb, frame.rgb)).without(left_out)
+    assert score_training_views(lambda _: rendering, [(seen, ~left_out)]) == TrainingFit(MAX_PSNR_DB, MAX_PSNR_DB, 1)
 
 
 def test_another_map_scores_worse() -> None:

@@ -91,9 +91,11 @@ def test_the_same_seed_gives_the_same_map() -> None:
     assert maps[0].means_m.tobytes() == maps[1].means_m.tobytes()
 
 
-def test_pixels_that_occlude_the_map_are_not_trained() -> None:
-    with pytest.raises(InvalidInputError, match="got 1: 0 show it"):
-        refine(patch(0.2), [view(1, depth_m=0.5)], ReferenceRasterizer(), QUICK)
+def test_pixels_that_occlude_the_map_or_are_left_out_are_not_trained() -> None:
+    left_out = view(1).frame.without(np.ones((CAMERA.height_px, CAMERA.width_px), np.bool_))
+    for own in (view(1, depth_m=0.5), AgentKeyframe("ant", left_out)):
+        with pytest.raises(InvalidInputError, match="got 1: 0 show it"):
+            refine(patch(0.2), [own], ReferenceRasterizer(), QUICK)
 
 
 def test_a_refinement_ends_when_it_no_longer_improves_and_is_never_worse_than_the_vote() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
@@ -141,7 +141,8 @@ class Frame:
     T_world_camera uses OpenCV axes (x right, y down, z forward); its position is within 10 km of the world's origin
     along each axis. motion: the camera's motion while the image was exposed, with T_world_camera the pose at the middle
     row's time; None for an image of a camera at rest. recorded_rgb: the same image before it was made smaller, for
-    detectors; None if it never was. Raises ShapeError, PoseError, InvalidInputError.
+    detectors; None if it never was. left_out: pixels that are neither seeded nor trained, None without any. Raises
+    ShapeError, PoseError, InvalidInputError.
     """
 
     index: int  # number in the sequence
@@ -152,6 +153,7 @@ class Frame:
     T_world_camera: Float64[ndarray, "4 4"]
     motion: CameraMotion | None = None
     recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
+    left_out: Bool[ndarray, "h w"] | None = None
 
     def __post_init__(self) -> None:
         require_whole("frame index", self.index)
@@ -160,6 +162,8 @@ class Frame:
         size = (self.camera.height_px, self.camera.width_px)
         require_array("frame rgb", self.rgb, (*size, 3), np.uint8)
         require_array("frame depth_m", self.depth_m, size, np.float32)
+        if self.left_out is not None:
+            require_array("frame left_out", self.left_out, size, np.bool_)
         require_array("frame T_world_camera", self.T_world_camera, (4, 4), np.float64)
         require_rigid("frame T_world_camera", self.T_world_camera)
         if np.abs(self.T_world_camera[:3, 3]).max() > MAX_COORDINATE_M:
@@ -169,6 +173,11 @@ class Frame:
             )
         if not np.isfinite(self.depth_m).all() or (self.depth_m < 0).any():
             raise InvalidInputError("frame depth_m: expected finite values of at least 0 (0 = no return)")
+
+    def without(self, pixels: Bool[ndarray, "h w"]) -> Frame:
+        """Return the frame with these pixels left out too, and without depth there."""
+        left_out = pixels if self.left_out is None else self.left_out | pixels
+        return replace(self, depth_m=np.where(pixels, np.float32(0), self.depth_m), left_out=left_out)
 
     @property
     def id(self) -> FrameId:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -16,7 +16,6 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist, orthonormal
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
-from gausslite.mapping.moving import without_pixels
 
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
@@ -29,6 +28,7 @@ def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
         "camera": np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
         "T_world_camera": frame.T_world_camera,
         **add_prefix("motion", _motion_state(frame.motion)),
+        **({} if frame.left_out is None else {"left_out": frame.left_out}),
     }
 
 
@@ -41,6 +41,7 @@ def frame_from_state(state: State) -> Frame:
     rgb = get_array(state, "rgb", (*depth_m.shape, 3), np.uint8).copy()
     T_world_camera = get_array(state, "T_world_camera", (4, 4), np.float64).copy()
     motion = _motion_from_state(select_prefix(state, "motion"))
+    left_out = get_array(state, "left_out", depth_m.shape, np.bool_).copy() if "left_out" in state else None
     return Frame(
         index=index,
         capture_time_ns=capture_time_ns,
@@ -49,6 +50,7 @@ def frame_from_state(state: State) -> Frame:
         camera=camera,
         T_world_camera=T_world_camera,
         motion=motion,
+        left_out=left_out,
     )
 
 
@@ -96,23 +98,17 @@ class Keyframe:
     recorded: Frame | None = None  # with the source's pose and colours, if `frame` has refined ones
     evaluated: bool = True  # False until the relevance to the present task is known; `relevance` is empty until then
     anchor: int = 0  # number of the keyframe that it follows when poses are corrected; its own, if it is one
-    hidden: Bool[ndarray, "h w"] | None = None  # pixels that showed what has moved since; None if there are none
 
     def with_relevance(self, relevance: RelevanceMap) -> Keyframe:
-        """Return the keyframe evaluated with this relevance; what has moved since is not relevant."""
-        shown = relevance if self.hidden is None else relevance.without(self.hidden)
-        return replace(self, relevance=shown, evaluated=True)
+        """Return the keyframe evaluated with this relevance; what the frame leaves out is not relevant."""
+        left_out = self.frame.left_out
+        return replace(self, relevance=relevance if left_out is None else relevance.without(left_out), evaluated=True)
 
-    def hide(self, pixels: Bool[ndarray, "h w"], rendered_rgb: Float32[ndarray, "h w 3"]) -> Keyframe:
-        """Return the keyframe with these pixels out of training; rendered_rgb: the map from its pose."""
-        recorded = None if self.recorded is None else without_pixels(self.recorded, pixels, rendered_rgb)
-        return replace(
-            self,
-            frame=without_pixels(self.frame, pixels, rendered_rgb),
-            recorded=recorded,
-            relevance=self.relevance.without(pixels),
-            hidden=pixels if self.hidden is None else self.hidden | pixels,
-        )
+    def without(self, pixels: Bool[ndarray, "h w"]) -> Keyframe:
+        """Return the keyframe with these pixels left out too."""
+        recorded = None if self.recorded is None else self.recorded.without(pixels)
+        relevance = self.relevance.without(pixels)
+        return replace(self, frame=self.frame.without(pixels), recorded=recorded, relevance=relevance)
 
     @property
     def as_recorded(self) -> Frame:
@@ -135,7 +131,6 @@ class Keyframe:
             **add_prefix("frame", frame_state(self.frame)),
             **add_prefix("relevance", relevance_state(self.relevance)),
             **add_prefix("recorded", recorded),
-            **({} if self.hidden is None else {"hidden": self.hidden}),
             "counts": int_array(self.evaluated, self.anchor),
         }
 
@@ -146,5 +141,4 @@ class Keyframe:
         recorded = select_prefix(state, "recorded")
         relevance = relevance_from_state(select_prefix(state, "relevance"), frame)
         evaluated, anchor = get_counts(state, "counts", 2)
-        hidden = get_array(state, "hidden", frame.depth_m.shape, np.bool_).copy() if "hidden" in state else None
-        return cls(frame, relevance, frame_from_state(recorded) if recorded else None, bool(evaluated), anchor, hidden)
+        return cls(frame, relevance, frame_from_state(recorded) if recorded else None, bool(evaluated), anchor)

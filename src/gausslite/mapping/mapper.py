@@ -33,7 +33,7 @@ from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows, rows_moved_away
 from gausslite.mapping.keyframe_store import KeyframeStore
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.moving import MOTION_REFERENCES, moving_pixels, without_pixels
+from gausslite.mapping.moving import MOTION_REFERENCES, moving_pixels
 from gausslite.mapping.pager import MapPager
 from gausslite.mapping.pose_corrector import PoseCorrector
 from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
@@ -150,16 +150,11 @@ class GaussianMapper:
             return FrameView(frame, RenderedView.from_rendering(rendering))
 
     def leave_out_moving(self, view: FrameView, scheduler: StageScheduler) -> FrameView:
-        """Return the view without the things that move; what has moved since an earlier keyframe is hidden there."""
-        count, frame = self.table.count, view.frame
-        moving = self._find_moving(frame)
+        """Return the view without the things that move; a keyframe loses what has moved since."""
+        count, moving = self.table.count, self._find_moving(view.frame)
         if view.rendered is None or self.table.count != count:
-            view = self.look(frame, scheduler)
-        if moving is None:
-            return view
-        with scheduler.timing(Stage.RENDERING):
-            seen = view.rendered or self._render(frame.camera, frame.T_world_camera, frame.motion)
-        return replace(view, frame=without_pixels(frame, moving, seen.rgb))
+            view = self.look(view.frame, scheduler)
+        return view if moving is None else replace(view, frame=view.frame.without(moving))
 
     def map_view(self, looked: FrameView, relevance: RelevanceMap, scheduler: StageScheduler) -> MappedFrame:
         """Seed and train the map with one frame; the scheduler limits the time.
@@ -354,7 +349,7 @@ class GaussianMapper:
             # beyond max_depth_m nothing is seeded, and one outlier would enlarge the extent for the whole mission
             largest_depth_m = min(float(frame.depth_m.max()), self.settings.seeding.max_depth_m)
             self._extent_m = max(self._extent_m, largest_depth_m * _EXTENT_PER_DEPTH)
-            keyframe = Keyframe(frame, relevance, anchor=self.store.next_anchor)
+            keyframe = Keyframe(frame, relevance, anchor=self.store.next_anchor).with_relevance(relevance)
             if self._refiner is not None and self.table.count:
                 keyframe = replace(keyframe, frame=self._refiner.refine(frame), recorded=frame)
             self.poses.refine(frame.id, keyframe.frame.T_world_camera)
@@ -371,7 +366,7 @@ class GaussianMapper:
                 self.store.replace(self._refiner.refine_keyframe(keyframe), self._window_view)
 
     def _find_moving(self, frame: Frame) -> Bool[ndarray, "h w"] | None:
-        """Return the pixels of things that move, None without any; hide in a keyframe what has moved since."""
+        """Return the pixels of things that move, None without any; leave out of a keyframe what has moved since."""
         keyframes = self.store.kept[-MOTION_REFERENCES:] if self.settings.leaves_out_moving else ()
         frames = [keyframe.frame for keyframe in keyframes]
         if keyframes:
@@ -383,8 +378,7 @@ class GaussianMapper:
                 contradicting = [*frames[:chosen], *later]
                 # they show where the thing was
                 self.table.remove(rows_moved_away(self.table.means_m, frames[chosen], moved, contradicting))
-                rendered = self._render(frames[chosen].camera, frames[chosen].T_world_camera, frames[chosen].motion)
-                self.store.replace(keyframes[chosen].hide(moved, rendered.rgb), self._window_view)
+                self.store.replace(keyframes[chosen].without(moved), self._window_view)
         moving = moving_pixels(frame, frames)
         return moving if moving.any() else None
 

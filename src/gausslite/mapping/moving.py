@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool
 from numpy import ndarray
 
 from gausslite.domain.camera import lift
@@ -52,16 +51,3 @@ def moving_pixels(frame: Frame, earlier: Sequence[Frame]) -> Bool[ndarray, "h w"
     large = [label for label in range(1, parts) if sizes[label, cv2.CC_STAT_AREA] >= _MIN_PART]
     shown = cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((2 * _GROWN + 1,) * 2, np.uint8))
     return np.repeat(np.repeat(shown > 0, step, axis=0), step, axis=1)[:height, :width]
-
-
-def without_pixels(frame: Frame, pixels: Bool[ndarray, "h w"], rendered_rgb: Float32[ndarray, "h w 3"]) -> Frame:
-    """Return the frame without depth in these pixels, and with the map's colours, so that nothing is seeded there.
-
-    The map's own colours give no gradient, so nothing is trained there either.
-    """
-    rgb = np.rint(np.clip(rendered_rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return replace(
-        frame,
-        rgb=np.where(pixels[..., None], rgb, frame.rgb),
-        depth_m=np.where(pixels, np.float32(0), frame.depth_m),
-    )

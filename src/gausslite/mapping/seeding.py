@@ -188,6 +188,8 @@ class Seeder:
         seeds = settings.first_frame_seeds if context.rendered is None else settings.later_seeds
         budget = max(1, round(seeds * frame.depth_m.size / _REFERENCE_PIXELS))  # N, for this image size
         seedable = (surface.depth_m > 0) & (surface.depth_m <= settings.max_depth_m)
+        if surface.left_out is not None:
+            seedable &= ~surface.left_out  # the filled depth has values there
         roi_candidates = candidates = seedable  # an empty map explains nothing
         if context.rendered is not None:
             behind = rendered_behind(frame, context.rendered, settings.depth_error_factor)

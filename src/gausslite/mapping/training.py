@@ -302,12 +302,16 @@ class Trainer:
         """
         for _ in range(_HALF_SIZE_VIEWS):
             view = next(turns)
-            if view.half_view is None:
-                self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, self._loss, self._adam)
-                break
             self._rasterizer.step(
-                *binding.tables, view.half_view, view.T_camera_world, self._loss, self._half_size_adam
+                *binding.tables,
+                view.image_view,
+                view.T_camera_world,
+                self._loss,
+                self._half_size_adam if view.is_half_size else self._adam,
+                masked=view.keyframe.frame.left_out is not None,
             )
+            if not view.is_half_size:
+                break
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
         report = self._rasterizer.step(

@@ -27,7 +27,8 @@ class WindowView:
 
     keyframe: Keyframe
     training_view: TrainingView  # prepared by the rasterizer, whole or masked to the ROI's tiles
-    half_view: TrainingView | None  # in half size, for iterations on whole images; None: they use training_view
+    image_view: TrainingView  # for iterations on whole images; has weights if the frame leaves out pixels
+    is_half_size: bool  # image_view
     T_camera_world: Float64[ndarray, "4 4"]
     roi: Subset  # the 16x16 tiles that touch the ROI or its margin
 
@@ -47,26 +48,31 @@ def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSe
     frame = keyframe.frame
     tiles, pixel_weights = roi_weights(keyframe.relevance.pixel_weights, settings.roi_context_weight)
     depth_m = without_depth_edges(frame.depth_m, settings.depth_edge_px)
-    return WindowView(
-        keyframe=keyframe,
-        training_view=rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, pixel_weights, frame.motion),
-        half_view=_half_view(frame, depth_m, rasterizer) if depth_m.size >= settings.half_size_from_px else None,
-        T_camera_world=inverse(frame.T_world_camera),
-        roi=Subset(tiles),
-    )
+    trained = None if frame.left_out is None else _with_whole_windows(~frame.left_out)
+    if trained is not None:
+        pixel_weights = pixel_weights * trained  # the context has weights there too
+    view = image_view = rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, pixel_weights, frame.motion)
+    is_half_size = depth_m.size >= settings.half_size_from_px
+    if is_half_size:
+        image_view = _half_view(frame, depth_m, rasterizer)
+    elif trained is not None:
+        image_view = rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, trained, frame.motion)
+    return WindowView(keyframe, view, image_view, is_half_size, inverse(frame.T_world_camera), Subset(tiles))
 
 
 def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Rasterizer) -> TrainingView:
     """Prepare the image in half size: colours averaged over 2x2 pixels, depths too where all four are measured."""
     width, height = frame.camera.width_px // 2, frame.camera.height_px // 2
-    rgb, halved_m, measured = (
-        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        for image in (frame.rgb, depth_m, (depth_m > 0).astype(np.float32))
-    )
+
+    def halved(image: ndarray) -> ndarray:
+        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
     # a mean with an unmeasured pixel would be too near
-    halved_m = np.where(measured > _ALL_MEASURED, halved_m, np.float32(0.0))
+    halved_m = np.where(halved((depth_m > 0).astype(np.float32)) > _ALL_MEASURED, halved(depth_m), np.float32(0.0))
+    left_out = None if frame.left_out is None else halved(frame.left_out.astype(np.float32))
+    weights = None if left_out is None else _with_whole_windows(left_out == 0)
     camera = frame.camera.resized(width, height)
-    return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, reduced_dilation_px2(2.0))
+    return rasterizer.prepare_view(halved(frame.rgb), halved_m, camera, weights, frame.motion, reduced_dilation_px2(2.0))
 
 
 def roi_weights(
@@ -92,7 +98,12 @@ def tiles_touching(mask: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, 
     return tiles
 
 
-def _pixels_inside(tiles: Bool[ndarray, "th tw"], shape: tuple[int, ...]) -> Bool[ndarray, "h w"]:
-    """Return the pixels whose whole SSIM window lies in these tiles; outside them nothing is rendered."""
+def _pixels_inside(tiles: Bool[ndarray, "th tw"], shape: tuple[int, ...]) -> Float32[ndarray, "h w"]:
+    """Return 1 where the whole SSIM window lies in these tiles, else 0; outside them nothing is rendered."""
     rendered = np.repeat(np.repeat(tiles, TILE_PX, axis=0), TILE_PX, axis=1)[: shape[0], : shape[1]]
-    return cv2.erode(rendered.astype(np.uint8), np.ones((_SSIM_WINDOW_PX, _SSIM_WINDOW_PX), np.uint8)) > 0
+    return _with_whole_windows(rendered)
+
+
+def _with_whole_windows(pixels: Bool[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+    """Return 1 for pixels whose whole SSIM window lies in these pixels, else 0."""
+    return cv2.erode(pixels.astype(np.float32), np.ones((_SSIM_WINDOW_PX, _SSIM_WINDOW_PX), np.uint8))

@@ -59,13 +59,12 @@ _MAX_PLANE_LEAN_SHARE = 0.1
 _INNER_PERCENTILES = (10.0, 90.0)
 
 
-def best_depth_m(
-    sensor_m: Float32[ndarray, "h w"], rendered_m: Float32[ndarray, "h w"] | None
-) -> Float32[ndarray, "h w"]:
-    """Return the rendered depth where the map is not empty, the sensor's depth elsewhere."""
-    if rendered_m is None or rendered_m.shape != sensor_m.shape:
-        return sensor_m
-    return np.where(rendered_m > 0, rendered_m, sensor_m)
+def best_depth_m(frame: Frame, rendered_m: Float32[ndarray, "h w"] | None) -> Float32[ndarray, "h w"]:
+    """Return the rendered depth where the map is not empty, the sensor's depth elsewhere and in what is left out."""
+    if rendered_m is None or rendered_m.shape != frame.depth_m.shape:
+        return frame.depth_m
+    is_rendered = rendered_m > 0 if frame.left_out is None else (rendered_m > 0) & ~frame.left_out
+    return np.where(is_rendered, rendered_m, frame.depth_m)
 
 
 def lift_detections(

@@ -192,7 +192,7 @@ class TaskRelevanceEstimator(DetectingEstimator):
         if not self._tracker.update_keyframe(frame):
             return RelevanceEstimate(self._tracker.propagate(frame))
         detections = self._detector.detect(frame, self._graph.queries)
-        depth_m = best_depth_m(frame.depth_m, rendered_depth_m)
+        depth_m = best_depth_m(frame, rendered_depth_m)
         relevance = self._tracker.integrate(frame, depth_m, detections)
         return RelevanceEstimate(relevance, detected=DetectedImage.of(frame, detections))
 
@@ -236,7 +236,7 @@ class AsyncRelevanceEstimator(DetectingEstimator):
         delayed, detected = self._collect()
         if self._tracker.update_keyframe(frame):
             self._skipped_keyframes += self._queued is not None
-            self._queued = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
+            self._queued = _Keyframe(frame, best_depth_m(frame, rendered_depth_m), self._frames)
         if self._running is None and self._queued is not None:
             future = self._executor.submit(self._detector.detect, self._queued.frame, self._graph.queries)
             self._running, self._queued = (self._queued, future), None

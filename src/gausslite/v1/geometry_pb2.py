@@ -24,17 +24,17 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bgausslite/v1/geometry.proto\x12\x0cgausslite.v1\"i\n\x06\x43\x61mera\x12\r\n\x05\x66x_px\x18\x01 \x01(\x01\x12\r\n\x05\x66y_px\x18\x02 \x01(\x01\x12\r\n\x05\x63x_px\x18\x03 \x01(\x01\x12\r\n\x05\x63y_px\x18\x04 \x01(\x01\x12\x10\n\x08width_px\x18\x05 \x01(\r\x12\x11\n\theight_px\x18\x06 \x01(\r\"#\n\x0eRigidTransform\x12\x11\n\trow_major\x18\x01 \x03(\x01\"M\n\x03\x42ox\x12\"\n\x05min_m\x18\x01 \x01(\x0b\x32\x13.gausslite.v1.Point\x12\"\n\x05max_m\x18\x02 \x01(\x0b\x32\x13.gausslite.v1.Point\"(\n\x05Point\x12\t\n\x01x\x18\x01 \x01(\x01\x12\t\n\x01y\x18\x02 \x01(\x01\x12\t\n\x01z\x18\x03 \x01(\x01\"\x1b\n\tVoxelGrid\x12\x0e\n\x06size_m\x18\x01 \x01(\x01\"\xdf\x02\n\x0c\x45ncodedFrame\x12\r\n\x05index\x18\x01 \x01(\x03\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x02 \x01(\x03\x12\x0e\n\x06\x63olour\x18\x03 \x01(\x0c\x12\x11\n\tdepth_png\x18\x04 \x01(\x0c\x12$\n\x06\x63\x61mera\x18\x05 \x01(\x0b\x32\x14.gausslite.v1.Camera\x12\x34\n\x0et_world_camera\x18\x06 \x01(\x0b\x32\x1c.gausslite.v1.RigidTransform\x12%\n\x04lens\x18\x07 \x01(\x0b\x32\x12.gausslite.v1.LensH\x00\x88\x01\x01\x12\x17\n\x0freadout_seconds\x18\x08 \x01(\x01\x12\x18\n\x10\x65xposure_seconds\x18\t \x01(\x01\x12\'\n\x05twist\x18\n \x01(\x0b\x32\x13.gausslite.v1.TwistH\x01\x88\x01\x01\x12\x12\n\nregion_png\x18\x0b \x01(\x0c\x42\x07\n\x05_lensB\x08\n\x06_twist\"D\n\x04Lens\x12&\n\x05model\x18\x01 \x01(\x0e\x32\x17.gausslite.v1.LensModel\x12\x14\n\x0c\x63oefficients\x18\x02 \x03(\x01\"\\\n\x05Twist\x12\'\n\nlinear_m_s\x18\x01 \x01(\x0b\x32\x13.gausslite.v1.Point\x12*\n\rangular_rad_s\x18\x02 \x01(\x0b\x32\x13.gausslite.v1.Point*V\n\tLensModel\x12\x1a\n\x16LENS_MODEL_UNSPECIFIED\x10\x00\x12\x15\n\x11LENS_MODEL_RADTAN\x10\x01\x12\x16\n\x12LENS_MODEL_FISHEYE\x10\x02*x\n\x0cLocalisation\x12\x1c\n\x18LOCALISATION_UNSPECIFIED\x10\x00\x12\x18\n\x14LOCALISATION_TRACKED\x10\x01\x12\x19\n\x15LOCALISATION_DOUBTFUL\x10\x02\x12\x15\n\x11LOCALISATION_LOST\x10\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bgausslite/v1/geometry.proto\x12\x0cgausslite.v1\"i\n\x06\x43\x61mera\x12\r\n\x05\x66x_px\x18\x01 \x01(\x01\x12\r\n\x05\x66y_px\x18\x02 \x01(\x01\x12\r\n\x05\x63x_px\x18\x03 \x01(\x01\x12\r\n\x05\x63y_px\x18\x04 \x01(\x01\x12\x10\n\x08width_px\x18\x05 \x01(\r\x12\x11\n\theight_px\x18\x06 \x01(\r\"#\n\x0eRigidTransform\x12\x11\n\trow_major\x18\x01 \x03(\x01\"M\n\x03\x42ox\x12\"\n\x05min_m\x18\x01 \x01(\x0b\x32\x13.gausslite.v1.Point\x12\"\n\x05max_m\x18\x02 \x01(\x0b\x32\x13.gausslite.v1.Point\"(\n\x05Point\x12\t\n\x01x\x18\x01 \x01(\x01\x12\t\n\x01y\x18\x02 \x01(\x01\x12\t\n\x01z\x18\x03 \x01(\x01\"\x1b\n\tVoxelGrid\x12\x0e\n\x06size_m\x18\x01 \x01(\x01\"\xf5\x02\n\x0c\x45ncodedFrame\x12\r\n\x05index\x18\x01 \x01(\x03\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x02 \x01(\x03\x12\x0e\n\x06\x63olour\x18\x03 \x01(\x0c\x12\x11\n\tdepth_png\x18\x04 \x01(\x0c\x12$\n\x06\x63\x61mera\x18\x05 \x01(\x0b\x32\x14.gausslite.v1.Camera\x12\x34\n\x0et_world_camera\x18\x06 \x01(\x0b\x32\x1c.gausslite.v1.RigidTransform\x12%\n\x04lens\x18\x07 \x01(\x0b\x32\x12.gausslite.v1.LensH\x00\x88\x01\x01\x12\x17\n\x0freadout_seconds\x18\x08 \x01(\x01\x12\x18\n\x10\x65xposure_seconds\x18\t \x01(\x01\x12\'\n\x05twist\x18\n \x01(\x0b\x32\x13.gausslite.v1.TwistH\x01\x88\x01\x01\x12\x12\n\nregion_png\x18\x0b \x01(\x0c\x12\x14\n\x0cleft_out_png\x18\x0c \x01(\x0c\x42\x07\n\x05_lensB\x08\n\x06_twist\"D\n\x04Lens\x12&\n\x05model\x18\x01 \x01(\x0e\x32\x17.gausslite.v1.LensModel\x12\x14\n\x0c\x63oefficients\x18\x02 \x03(\x01\"\\\n\x05Twist\x12\'\n\nlinear_m_s\x18\x01 \x01(\x0b\x32\x13.gausslite.v1.Point\x12*\n\rangular_rad_s\x18\x02 \x01(\x0b\x32\x13.gausslite.v1.Point*V\n\tLensModel\x12\x1a\n\x16LENS_MODEL_UNSPECIFIED\x10\x00\x12\x15\n\x11LENS_MODEL_RADTAN\x10\x01\x12\x16\n\x12LENS_MODEL_FISHEYE\x10\x02*x\n\x0cLocalisation\x12\x1c\n\x18LOCALISATION_UNSPECIFIED\x10\x00\x12\x18\n\x14LOCALISATION_TRACKED\x10\x01\x12\x19\n\x15LOCALISATION_DOUBTFUL\x10\x02\x12\x15\n\x11LOCALISATION_LOST\x10\x03\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.geometry_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_LENSMODEL']._serialized_start=857
-  _globals['_LENSMODEL']._serialized_end=943
-  _globals['_LOCALISATION']._serialized_start=945
-  _globals['_LOCALISATION']._serialized_end=1065
+  _globals['_LENSMODEL']._serialized_start=879
+  _globals['_LENSMODEL']._serialized_end=965
+  _globals['_LOCALISATION']._serialized_start=967
+  _globals['_LOCALISATION']._serialized_end=1087
   _globals['_CAMERA']._serialized_start=45
   _globals['_CAMERA']._serialized_end=150
   _globals['_RIGIDTRANSFORM']._serialized_start=152
@@ -46,9 +46,9 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_VOXELGRID']._serialized_start=310
   _globals['_VOXELGRID']._serialized_end=337
   _globals['_ENCODEDFRAME']._serialized_start=340
-  _globals['_ENCODEDFRAME']._serialized_end=691
-  _globals['_LENS']._serialized_start=693
-  _globals['_LENS']._serialized_end=761
-  _globals['_TWIST']._serialized_start=763
-  _globals['_TWIST']._serialized_end=855
+  _globals['_ENCODEDFRAME']._serialized_end=713
+  _globals['_LENS']._serialized_start=715
+  _globals['_LENS']._serialized_end=783
+  _globals['_TWIST']._serialized_start=785
+  _globals['_TWIST']._serialized_end=877
 # @@protoc_insertion_point(module_scope)

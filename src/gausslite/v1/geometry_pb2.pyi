@@ -212,6 +212,7 @@ class EncodedFrame(_message.Message):
     EXPOSURE_SECONDS_FIELD_NUMBER: _builtins.int
     TWIST_FIELD_NUMBER: _builtins.int
     REGION_PNG_FIELD_NUMBER: _builtins.int
+    LEFT_OUT_PNG_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     capture_time_ns: _builtins.int
     """By the robot's clock, increasing from frame to frame; it spreads the kept keyframes over the mission."""
@@ -228,6 +229,10 @@ class EncodedFrame(_message.Message):
     region_png: _builtins.bytes
     """The pixels of the task's region, as the agent knew them when it sent a keyframe: PNG of the images' size, one
     channel, up to 8 bits, 0 outside. For people: refinement does not use it. Empty if unknown; IngestFrames ignores it.
+    """
+    left_out_png: _builtins.bytes
+    """The pixels of a keyframe that show things that move, which refinement leaves out: like region_png. Empty without
+    any; IngestFrames ignores it.
     """
     @_builtins.property
     def camera(self) -> Global___Camera: ...
@@ -257,10 +262,11 @@ class EncodedFrame(_message.Message):
         exposure_seconds: _builtins.float = ...,
         twist: Global___Twist | None = ...,
         region_png: _builtins.bytes = ...,
+        left_out_png: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_lens", b"_lens", "_twist", b"_twist", "camera", b"camera", "lens", b"lens", "t_world_camera", b"t_world_camera", "twist", b"twist"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_lens", b"_lens", "_twist", b"_twist", "camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "depth_png", b"depth_png", "exposure_seconds", b"exposure_seconds", "index", b"index", "lens", b"lens", "readout_seconds", b"readout_seconds", "region_png", b"region_png", "t_world_camera", b"t_world_camera", "twist", b"twist"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_lens", b"_lens", "_twist", b"_twist", "camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "depth_png", b"depth_png", "exposure_seconds", b"exposure_seconds", "index", b"index", "left_out_png", b"left_out_png", "lens", b"lens", "readout_seconds", b"readout_seconds", "region_png", b"region_png", "t_world_camera", b"t_world_camera", "twist", b"twist"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__lens: _TypeAlias = _typing.Literal["lens"]  # noqa: Y015
     _WhichOneofArgType__lens: _TypeAlias = _typing.Literal["_lens", b"_lens"]  # noqa: Y015

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -145,7 +145,7 @@ def decode_mask(data: bytes, width_px: int, height_px: int) -> Bool[ndarray, "h 
 
 
 def decode_region(data: bytes, camera: Camera) -> Bool[ndarray, "h w"] | None:
-    """Decode the region of a keyframe; None for empty bytes. Raises InvalidInputError."""
+    """Decode a mask of a keyframe; None for empty bytes. Raises InvalidInputError."""
     return decode_mask(data, camera.width_px, camera.height_px) if data else None
 
 
@@ -252,6 +252,8 @@ def frame_to_message(
         linear, angular = (point_to_message(xyz) for xyz in (motion.twist.linear_m_s, motion.twist.angular_rad_s))
         twist = geometry_pb2.Twist(linear_m_s=linear, angular_rad_s=angular)
         optional |= {"readout_seconds": motion.readout_s, "exposure_seconds": motion.exposure_s, "twist": twist}
+    if frame.left_out is not None:
+        optional["left_out_png"] = encode_mask(frame.left_out)
     return geometry_pb2.EncodedFrame(
         index=frame.index,
         capture_time_ns=frame.capture_time_ns,
@@ -267,7 +269,8 @@ def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
     """Decode a frame without lens distortion, whose images have the camera's size. Raises InvalidInputError."""
     if message.HasField("lens"):
         raise InvalidInputError("frame lens: expected an undistorted image; only an agent's IngestFrames takes a lens")
-    return _decode_images(message)
+    frame = _decode_images(message)
+    return replace(frame, left_out=decode_region(message.left_out_png, frame.camera))
 
 
 def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> tuple[Frame, Lens | None]:

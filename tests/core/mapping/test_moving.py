@@ -1,23 +1,23 @@
 """Things that move: found where earlier frames saw through their place, and left out of the map."""
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
+from mapping_scenes import middle_relevance
 
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.moving import moving_pixels
-from gausslite.mapping.settings import MapperSettings, OptimizationSettings
+from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
+from gausslite.mapping.stages import CountedScheduler
 from gausslite.mission.build import build_mapper, region_estimator
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import MOVING, TaskMapper
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import Rendering
 from gausslite_sim.home_settings import HomeSettings
 
 CAMERA = Camera(160.0, 160.0, 80.0, 60.0, 160, 120)
@@ -35,6 +35,10 @@ def frame(index: int, left_px: int | None, x_m: float = 0.0) -> Frame:
     T_world_camera = np.eye(4)
     T_world_camera[0, 3] = x_m
     return Frame(index, index * 10**8, rgb, depth_m, CAMERA, T_world_camera)
+
+
+def uniform_mapper() -> TaskMapper:
+    return TaskMapper(region_estimator([]), build_mapper(MissionSettings(max_gaussians=3000, iterations=1, threads=1)))
 
 
 def test_what_stands_where_two_earlier_frames_saw_through_moves() -> None:
@@ -57,9 +61,7 @@ def test_a_place_that_was_not_seen_or_that_stays_occupied_shows_no_motion() -> N
 
 
 def test_a_thing_that_moves_is_neither_seeded_nor_kept_in_a_keyframe() -> None:
-    mapper = TaskMapper(
-        region_estimator([]), build_mapper(MissionSettings(max_gaussians=3000, iterations=1, threads=1))
-    )
+    mapper = uniform_mapper()
     for index in range(12):
         mapper.process(frame(index, None if index < 6 else 20 * (index - 6)))
     assert (mapper.gaussians().means_m[:, 2] > (WALL_M + BOX_M) / 2).all()
@@ -69,9 +71,7 @@ def test_a_thing_that_moves_is_neither_seeded_nor_kept_in_a_keyframe() -> None:
 
 
 def test_a_frame_in_which_everything_moves_is_skipped() -> None:
-    mapper = TaskMapper(
-        region_estimator([]), build_mapper(MissionSettings(max_gaussians=3000, iterations=1, threads=1))
-    )
+    mapper = uniform_mapper()
     for index in range(6):
         mapper.process(frame(index, None))
     close = frame(6, None)
@@ -84,9 +84,7 @@ def test_a_frame_in_which_everything_moves_is_skipped() -> None:
 
 
 def test_a_keyframe_loses_what_has_left_its_place_later() -> None:
-    mapper = TaskMapper(
-        region_estimator([]), build_mapper(MissionSettings(max_gaussians=3000, iterations=1, threads=1))
-    )
+    mapper = uniform_mapper()
     for index in range(20):
         mapper.process(frame(index, 80 if index == 0 else None))
     first = mapper.keyframes()[0].frame
@@ -95,29 +93,23 @@ def test_a_keyframe_loses_what_has_left_its_place_later() -> None:
     assert (mapper.gaussians().means_m[:, 2] > (WALL_M + BOX_M) / 2).all(), "a thing left Gaussians behind"
 
 
-class CountingRasterizer(CpuRasterizer):
-    """Counts the renderings of the map."""
-
-    def __init__(self) -> None:
-        super().__init__(threads=1)
-        self.renderings = 0
-
-    def forward(self, *arguments: Any, **options: Any) -> Rendering:
-        self.renderings += 1
-        return super().forward(*arguments, **options)
-
-
-def test_a_moving_thing_costs_at_most_two_renderings_in_a_frame() -> None:
-    rasterizer = CountingRasterizer()
-    settings = MapperSettings(max_gaussians=3000, optimization=OptimizationSettings().with_iterations(1))
-    mapper = TaskMapper(region_estimator([]), GaussianMapper(settings, rasterizer))
-    renderings = []
-    for index in range(18):
-        rasterizer.renderings = 0
-        mapper.process(frame(index, 80 if index == 0 else None if index < 6 else 10 * (index - 6)))
-        renderings.append(rasterizer.renderings)
-    assert any(keyframe.hidden is not None for keyframe in mapper.keyframes())
-    assert max(renderings) == 2
+@pytest.mark.parametrize("half_size_from_px", [10**6, 1])
+def test_the_colours_of_pixels_that_are_left_out_have_no_influence_on_the_map(half_size_from_px: int) -> None:
+    keyframes, iterations = (
+        KeyframeSettings(half_size_from_px=half_size_from_px),
+        OptimizationSettings().with_iterations(8),
+    )
+    settings = MapperSettings(max_gaussians=3000, keyframes=keyframes, optimization=iterations)
+    left_out, maps = np.zeros((120, 160), np.bool_), []
+    left_out[20:100, 40:100] = True
+    for level in (0, 255):
+        mapper, coloured = GaussianMapper(settings, CpuRasterizer(threads=1)), frame(0, None)
+        coloured.rgb[22:98, 42:98] = level  # seeds depend on the edges beside them
+        for shown in (coloured.without(left_out), frame(1, None)):
+            mapper.map_view(FrameView(shown), middle_relevance(shown), CountedScheduler())
+        assert not mapper.store.kept[0].relevance.roi[left_out].any()
+        maps.append(mapper.table.rows.tobytes())
+    assert maps[0] == maps[1]
 
 
 def test_a_simulated_home_has_a_box_that_moves() -> None:

@@ -184,10 +184,10 @@ def test_a_keyframe_of_which_a_part_has_moved_receives_its_delayed_relevance_wit
     for frame in (close, *map(frame_at, range(1, 20))):
         loop.process(frame)
     first = loop.keyframes()[0]
-    assert first.hidden is not None
+    assert first.frame.left_out is not None
     assert not first.relevance.roi.any()
     executor.run_next()
     loop.process(frame_at(20))
     relevance = loop.keyframes()[0].relevance
     assert relevance.roi.any()
-    assert not relevance.roi[first.hidden].any()
+    assert not relevance.roi[first.frame.left_out].any()

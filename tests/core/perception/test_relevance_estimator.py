@@ -110,9 +110,11 @@ def test_without_depth_nothing_is_marked():
 
 
 def test_rendered_depth_overrides_sensor_depth():
-    sensor, rendered = np.full((2, 2), 3.0, np.float32), np.array([[1, 0], [0, 2]], np.float32)
-    assert best_depth_m(sensor, rendered).tolist() == [[1, 3], [3, 2]]
-    assert best_depth_m(sensor, None) is sensor
+    sensor, rendered = frame_at(), np.zeros(frame_at().depth_m.shape, np.float32)
+    rendered[0, :2] = 1.0
+    assert best_depth_m(sensor, rendered)[0, :3].tolist() == [1, 1, sensor.depth_m[0, 2]]
+    assert best_depth_m(sensor.without(rendered > 0), rendered)[0, :2].tolist() == [0, 0]
+    assert best_depth_m(sensor, None) is sensor.depth_m
 
 
 def test_a_target_with_an_unseen_anchor_is_kept_with_a_note():

@@ -62,7 +62,7 @@ def sample_frame() -> Frame:
     depth_m[0] = 0
     T = np.eye(4)
     T[:3, 3] = 1, 2, 3
-    return Frame(7, 123_456_789, np.ascontiguousarray(smooth), depth_m, CAMERA, T)
+    return Frame(7, 123_456_789, np.ascontiguousarray(smooth), depth_m, CAMERA, T, left_out=depth_m < 20)
 
 
 @pytest.mark.parametrize("lossless", [True, False])
@@ -76,6 +76,7 @@ def test_a_frame_is_unchanged_by_a_round_trip(lossless: bool) -> None:
     assert not got.depth_m[~in_reach].any()
     difference = np.abs(got.rgb.astype(int) - sent.rgb)
     assert difference.max() == 0 if lossless else difference.mean() < 3
+    np.testing.assert_array_equal(got.left_out, sent.left_out)
 
 
 def test_a_task_graph_is_unchanged_by_a_round_trip() -> None:
@@ -179,7 +180,7 @@ def test_a_frames_motion_is_unchanged_by_a_round_trip() -> None:
 def test_a_live_frame_is_unchanged_by_a_round_trip() -> None:
     sent = replace(sample_frame(), motion=MOTION)
     got, lens = convert.live_frame_from_message(convert.frame_to_message(sent, lossless=True, lens=LENS))
-    assert (got.camera, lens) == (sent.camera, LENS)
+    assert (got.camera, lens, got.left_out) == (sent.camera, LENS, None)
     np.testing.assert_array_equal(got.rgb, sent.rgb)
     assert got.motion is not None
     assert (got.motion.readout_s, got.motion.exposure_s) == (MOTION.readout_s, MOTION.exposure_s)
