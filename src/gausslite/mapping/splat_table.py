@@ -228,13 +228,10 @@ class SplatTable:
         self._columns["anchor"][ids] = anchor
 
     def adopt(self, ids: Int64[ndarray, " m"], updates: int, beta2: float) -> None:
-        """Give these Gaussians a number of updates, and in each column the median second moment of the trained rows.
-
-        If no row is trained, nothing changes.
-        """
+        """Give these Gaussians a number of updates, and the median second moment of trained rows, if there are any."""
         counts = self.rows[:, UPDATE_COUNT].astype(np.float64)
         trained = np.flatnonzero(counts >= min(_UPDATES_OF_TRAINED, max(counts.max(), 1.0)))
-        if len(trained) == 0:
+        if len(ids) == 0 or len(trained) == 0:
             return
         corrected = self.second_moment[trained] / (1.0 - beta2 ** counts[trained, None])
         self.second_moment[ids] = np.median(corrected, axis=0) * (1.0 - beta2**updates)

@@ -26,7 +26,7 @@ from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.mapping.view_rotation import ViewRotation
 from gausslite.mapping.window_view import WindowView
-from gausslite.render.rasterizer import UPDATE_COUNT, Rasterizer, Subset, UpdateCounter
+from gausslite.render.rasterizer import UPDATE_COUNT, AdamSettings, Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
 """Steps behind the running mean; no iteration is released before that many."""
@@ -220,21 +220,17 @@ class Trainer:
         Without moments, Adam's first steps have full length whatever the gradient: one frame ruins a finished map. So
         do dozens of steps on the first view, which an iteration with few views repeats on a new map.
         """
-        table, active_views = self._table, self._settings.optimization.active_views
-        is_loaded = table.anchor == NO_ANCHOR
-        self._active_views = active_views
+        table, self._active_views = self._table, self._settings.optimization.active_views
+        is_loaded, counts = table.anchor == NO_ANCHOR, table.rows[:, UPDATE_COUNT]
         if not is_loaded.any():
             return
-        self._active_views = min(active_views, sum(view.shows_roi for view in views))
-        counts = table.rows[:, UPDATE_COUNT]
+        self._active_views = min(self._active_views, sum(view.shows_roi for view in views))
         new = np.flatnonzero(is_loaded & (counts == 0))
         if len(new) > 0 and not counts.any():
-            tables = _Binding.of(table, self._settings.optimization.active_phase).tables
-            with self._rasterizer.bind_tables(*tables):
-                view = views[-1]
-                self._rasterizer.step(*tables, view.training_view, view.T_camera_world, self._loss, self._resting_adam)
-        if len(new) > 0:
-            table.adopt(new, _LOADED_UPDATES, self._adam.beta2)
+            binding = _Binding.of(table, self._settings.optimization.active_phase)
+            with self._rasterizer.bind_tables(*binding.tables):
+                self._train_image(binding, views[-1], self._resting_adam)
+        table.adopt(new, _LOADED_UPDATES, self._adam.beta2)
 
     def _turns(self, views: Sequence[WindowView]) -> dict[Stage, Iterator[WindowView]]:
         """Return the views of each phase in the order of training (MVO), without end.
@@ -302,16 +298,13 @@ class Trainer:
         """
         for _ in range(_HALF_SIZE_VIEWS):
             view = next(turns)
-            self._rasterizer.step(
-                *binding.tables,
-                view.image_view,
-                view.T_camera_world,
-                self._loss,
-                self._half_size_adam if view.is_half_size else self._adam,
-                masked=view.keyframe.frame.left_out is not None,
-            )
+            self._train_image(binding, view, self._half_size_adam if view.is_half_size else self._adam)
             if not view.is_half_size:
                 break
+
+    def _train_image(self, binding: _Binding, view: WindowView, adam: AdamSettings) -> None:
+        is_masked = view.keyframe.frame.left_out is not None
+        self._rasterizer.step(*binding.tables, view.image_view, view.T_camera_world, self._loss, adam, masked=is_masked)
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
         report = self._rasterizer.step(

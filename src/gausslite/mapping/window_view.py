@@ -72,7 +72,9 @@ def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Raste
     left_out = None if frame.left_out is None else halved(frame.left_out.astype(np.float32))
     weights = None if left_out is None else _with_whole_windows(left_out == 0)
     camera = frame.camera.resized(width, height)
-    return rasterizer.prepare_view(halved(frame.rgb), halved_m, camera, weights, frame.motion, reduced_dilation_px2(2.0))
+    return rasterizer.prepare_view(
+        halved(frame.rgb), halved_m, camera, weights, frame.motion, reduced_dilation_px2(2.0)
+    )
 
 
 def roi_weights(
