@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import PoseExposurePrior
@@ -18,6 +19,34 @@ means. With those of 3DGS, small seeds do not grow enough to blend. They decay f
 with constant rates, Gaussians oscillate between views, and more iterations make a region worse (bench/results).
 """
 BALANCED_LOSS = LossWeights(normalise_by_image=True)
+_COUNTS = ("first_frame_seeds", "later_seeds", "every", "window", "buffer", "half_size_from_px", "max_pixels")
+_INTERVALS = ("active_views", "densify_every", "prune_every", "max_gaussians")
+_SEED_SHARES = ("roi_share", "min_alpha", "roi_min_alpha", "min_density_ratio", "background_share")
+_SHARES = (*_SEED_SHARES, "roi_context_weight", "max_released", "pose_anchor_share")
+_SIZES = ("roi_pixels_per_gaussian", "depth_error_factor", "max_depth_m", "roi_scale", "background_scale", "init_scale")
+_BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys((*_COUNTS, *_INTERVALS), (1.0, math.inf)),
+    **dict.fromkeys(_SHARES, (0.0, 1.0)),
+    **dict.fromkeys(_SIZES, (1e-9, math.inf)),
+    "opacity": (1e-6, 1.0 - 1e-6),
+    "ema_updates": (0.0, 1e9),
+    "saturated": (-math.inf, math.inf),
+}
+"""Bounds of the numbers below; those of others are 0 and infinity."""
+
+
+class _Section:
+    """Settings whose numbers are within their bounds. Raises InvalidInputError with the name of one that is not."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        section: Any = self
+        for name in (setting.name for setting in fields(section)):
+            value, (low, high) = getattr(self, name), _BOUNDS.get(name, (0.0, math.inf))
+            if isinstance(value, int | float) and not low <= value <= high:
+                place = type(self).__name__.removesuffix("Settings").lower()
+                raise InvalidInputError(f"{place} {name}: expected {low:g} to {high:g}, got {value}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +80,7 @@ class ActivePhase(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class SeedingSettings:
+class SeedingSettings(_Section):
     """Placement and initialisation of new Gaussians (Sec. III-C)."""
 
     first_frame_seeds: int = 60_000  # N for the first image of 640x480; scaled with the number of pixels
@@ -72,25 +101,9 @@ class SeedingSettings:
     # also seed blocks without a measured depth (`with_filled_depth`): their colours distort the Gaussians around
     fill_depth: bool = True
 
-    def __post_init__(self) -> None:
-        for name in ("first_frame_seeds", "later_seeds"):
-            _require(getattr(self, name) >= 1, f"seeding {name}", "at least 1", getattr(self, name))
-        for name in ("roi_share", "min_alpha", "roi_min_alpha", "min_density_ratio", "background_share"):
-            _require(0 <= getattr(self, name) <= 1, f"seeding {name}", "0 to 1", getattr(self, name))
-        _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
-        for name in (
-            "roi_pixels_per_gaussian",
-            "depth_error_factor",
-            "max_depth_m",
-            "roi_scale",
-            "background_scale",
-            "init_scale",
-        ):
-            _require(getattr(self, name) > 0, f"seeding {name}", "more than 0", getattr(self, name))
-
 
 @dataclass(frozen=True, slots=True)
-class KeyframeSettings:
+class KeyframeSettings(_Section):
     """Keyframes to train on (Sec. III-D.2) and to keep for joint refinement (Sec. III-E)."""
 
     every: int = 5  # every `every`th mapped frame is a keyframe
@@ -107,14 +120,6 @@ class KeyframeSettings:
     half_size_from_px: float = 150_000
     max_pixels: int = 160_000_000  # of all keyframes, reached with images above 1280x720; a pixel needs 13 to 20 bytes
 
-    def __post_init__(self) -> None:
-        for name in ("every", "window", "buffer", "half_size_from_px", "max_pixels"):
-            _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        for name in ("long_term_keyframes", "pose_updates_per_frame", "depth_edge_px"):
-            _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
-        weight = self.roi_context_weight
-        _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
-
     def for_image_size(self, pixels: int) -> KeyframeSettings:
         """Return these settings with as many keyframes as max_pixels allows, at least one of each kind."""
         share = min(1.0, self.max_pixels / (pixels * (self.window + 2 * self.long_term_keyframes + self.buffer)))
@@ -127,7 +132,7 @@ class KeyframeSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class OptimizationSettings:
+class OptimizationSettings(_Section):
     """Training with one frame (Sec. III-D): warm-up iterations on full images, then active ones in the ROI."""
 
     warmup_iterations: int = 2  # on whole images; they keep the background in place
@@ -142,13 +147,6 @@ class OptimizationSettings:
     # time constant of the average of a Gaussian that is shown and saved; 0 shows the trained values
     ema_updates: float = 32.0
 
-    def __post_init__(self) -> None:
-        for name in ("warmup_iterations", "active_iterations"):
-            _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
-        _require(self.active_views >= 1, "optimization active_views", "at least 1", self.active_views)
-        updates = self.ema_updates
-        _require(0 <= updates < math.inf, "optimization ema_updates", "at least 0", updates)
-
     @property
     def iterations(self) -> int:
         """Iterations per frame."""
@@ -159,7 +157,8 @@ class OptimizationSettings:
 
         Of two or more iterations, at least one is a warm-up.
         """
-        _require(iterations >= 0, "optimization iterations", "at least 0", iterations)
+        if iterations < 0:
+            raise InvalidInputError(f"optimization iterations: expected at least 0, got {iterations}")
         warmup = round(iterations * self.warmup_iterations / max(self.iterations, 1))
         if self.warmup_iterations > 0:
             warmup = max(warmup, min(1, iterations // 2))
@@ -167,7 +166,7 @@ class OptimizationSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class SaturationSettings:
+class SaturationSettings(_Section):
     """Release of active iterations to whole images, by the mean decrease of the log loss per visit of a view.
 
     Between `improving` and `saturated`, the share of the released iterations is linear.
@@ -178,13 +177,13 @@ class SaturationSettings:
     saturated: float = 0.04  # from this one downwards, max_released
 
     def __post_init__(self) -> None:
-        _require(0 <= self.max_released <= 1, "saturation max_released", "0 to 1", self.max_released)
-        is_less = -math.inf < self.saturated < self.improving < math.inf
-        _require(is_less, "saturation saturated", f"less than improving ({self.improving})", self.saturated)
+        _Section.__post_init__(self)  # no super(): slots make another class
+        if not -math.inf < self.saturated < self.improving:
+            raise InvalidInputError(f"saturation saturated: expected less than {self.improving}, got {self.saturated}")
 
 
 @dataclass(frozen=True, slots=True)
-class DensitySettings:
+class DensitySettings(_Section):
     """Settings of density control, as in 3DGS."""
 
     densify_every: int = 150  # mapping iterations
@@ -195,15 +194,9 @@ class DensitySettings:
     prune_every: int = 100  # mapping iterations
     min_opacity: float = 0.005  # Gaussians below are pruned
 
-    def __post_init__(self) -> None:
-        for name in ("densify_every", "prune_every"):
-            _require(getattr(self, name) >= 1, f"density {name}", "at least 1 iteration", getattr(self, name))
-        for name in ("min_mean_gradient", "percent_dense", "max_growth", "min_opacity"):
-            _require(getattr(self, name) >= 0, f"density {name}", "at least 0", getattr(self, name))
-
 
 @dataclass(frozen=True, slots=True)
-class MapperSettings:
+class MapperSettings(_Section):
     """A mapping policy."""
 
     max_gaussians: int = 1_000_000  # hard cap; memory for exactly this number is allocated at the start
@@ -219,13 +212,3 @@ class MapperSettings:
     # of the mission's mean correction, by which each refined pose moves back; 0 without odometry
     pose_anchor_share: float = 0.1
     leaves_out_moving: bool = True  # pixels of things that move are neither seeded nor trained
-
-    def __post_init__(self) -> None:
-        _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)
-        share = self.pose_anchor_share
-        _require(0 <= share <= 1, "pose_anchor_share", "0 to 1", share)
-
-
-def _require(valid: bool, name: str, expected: str, value: float) -> None:
-    if not valid:
-        raise InvalidInputError(f"{name}: expected {expected}, got {value}")
