@@ -9,7 +9,6 @@ from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.settings import (
-    ActivePhase,
     Components,
     DensitySettings,
     KeyframeSettings,
@@ -65,9 +64,7 @@ def paper_policy() -> MapperSettings:
             roi_min_alpha=0.6, roi_pixels_per_gaussian=1.0, fill_sparse_roi=False, min_density_ratio=1.0
         ),
         keyframes=KeyframeSettings(pose_updates_per_frame=0),
-        optimization=OptimizationSettings(
-            active_phase=ActivePhase.ACTIVE_ONLY, loss=LossWeights(), adam=AdamSettings()
-        ),
+        optimization=OptimizationSettings(active_only=True, loss=LossWeights(), adam=AdamSettings()),
         density=DensitySettings(max_growth=1.0),
     )
     return disable(published, EXTENSION_FLAGS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from enum import StrEnum
 from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
@@ -70,15 +69,6 @@ class Components:
         return self.sb or self.roi or self.sis or self.gfd
 
 
-class ActivePhase(StrEnum):
-    """Which Gaussians the iterations of the active phase render and update; their loss is always masked to the ROI."""
-
-    ALL_GAUSSIANS = "all-gaussians"
-    """Render and update all Gaussians in the ROI's tiles, active or not."""
-    ACTIVE_ONLY = "active-only"
-    """Render and update active Gaussians only (Sec. III-D.1): cheaper, but no background occludes the ROI's border."""
-
-
 @dataclass(frozen=True, slots=True)
 class SeedingSettings(_Section):
     """Placement and initialisation of new Gaussians (Sec. III-C)."""
@@ -139,7 +129,9 @@ class OptimizationSettings(_Section):
     active_iterations: int = 6  # in the region's tiles
     # trained in turn by an active iteration, if their tiles are no more than one image; 1 as the paper
     active_views: int = 8
-    active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS  # which Gaussians these render and update
+    # an active iteration renders and updates active Gaussians alone (Sec. III-D.1): cheaper, but no background occludes
+    # the ROI's border; its loss is masked to the ROI in any case
+    active_only: bool = False
     # Eq. (2), divided by the image's pixels: Adam's steps with small masks stay comparable
     loss: LossWeights = BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES  # learning rates

@@ -21,7 +21,7 @@ from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import FrameId
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.density import densify, prune
-from gausslite.mapping.settings import ActivePhase, MapperSettings, SaturationSettings
+from gausslite.mapping.settings import MapperSettings, SaturationSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.mapping.view_rotation import ViewRotation
@@ -120,11 +120,11 @@ class _Binding:
     kappa_counter: UpdateCounter
 
     @classmethod
-    def of(cls, table: SplatTable, phase: ActivePhase) -> _Binding:
+    def of(cls, table: SplatTable, active_only: bool) -> _Binding:
         """Return the binding of all rows, valid until the table grows or shrinks. Kappa counts active Gaussians."""
         return cls(
             tables=(table.rows, table.first_moment, table.second_moment),
-            active_ids=np.flatnonzero(table.active).astype(np.uint32) if phase is ActivePhase.ACTIVE_ONLY else None,
+            active_ids=np.flatnonzero(table.active).astype(np.uint32) if active_only else None,
             kappa_counter=UpdateCounter(table.kappa, table.active),
         )
 
@@ -198,7 +198,7 @@ class Trainer:
         stage = self._next_stage(self._iterations, Stage.ACTIVE in turns, scheduler)
         if stage is None:
             return
-        binding = _Binding.of(self._table, self._settings.optimization.active_phase)
+        binding = _Binding.of(self._table, self._settings.optimization.active_only)
         with self._rasterizer.bind_tables(*binding.tables):
             self._iterate(binding, stage, turns[stage])
         self._control_density(extent_m, scheduler)
@@ -227,7 +227,7 @@ class Trainer:
         self._active_views = min(self._active_views, sum(view.shows_roi for view in views))
         new = np.flatnonzero(is_loaded & (counts == 0))
         if len(new) > 0 and not counts.any():
-            binding = _Binding.of(table, self._settings.optimization.active_phase)
+            binding = _Binding.of(table, self._settings.optimization.active_only)
             with self._rasterizer.bind_tables(*binding.tables):
                 self._train_image(binding, views[-1], self._resting_adam)
         table.adopt(new, _LOADED_UPDATES, self._adam.beta2)
@@ -266,7 +266,7 @@ class Trainer:
 
         The rasterizer holds the tables meanwhile; rows move only in density control.
         """
-        binding = _Binding.of(self._table, self._settings.optimization.active_phase)
+        binding = _Binding.of(self._table, self._settings.optimization.active_only)
         with self._rasterizer.bind_tables(*binding.tables):
             while (stage := self._next_stage(done, Stage.ACTIVE in turns, scheduler)) is not None:
                 with scheduler.timing(stage):

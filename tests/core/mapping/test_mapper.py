@@ -14,7 +14,6 @@ from gausslite.domain.state import select_prefix
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import (
-    ActivePhase,
     Components,
     DensitySettings,
     KeyframeSettings,
@@ -111,16 +110,16 @@ def test_the_active_phase_trains_on_earlier_keyframes_of_the_region() -> None:
     assert mapper.gaussians().kappa.max() > before
 
 
-@pytest.mark.parametrize("phase", list(ActivePhase))
-def test_each_kind_of_active_phase_trains_the_region(phase: ActivePhase) -> None:
-    optimization = OptimizationSettings(warmup_iterations=0, active_iterations=8, active_phase=phase)
+@pytest.mark.parametrize("active_only", [False, True])
+def test_both_kinds_of_active_iterations_train_the_region(active_only: bool) -> None:
+    optimization = OptimizationSettings(warmup_iterations=0, active_iterations=8, active_only=active_only)
     mapper = mapper_of(replace(SMALL, optimization=optimization, density=DensitySettings()))
     frame = wall_frame(0, SIZE)
     map_frame(mapper, frame)
     gaussians = mapper.gaussians()
     untrained = np.isclose(gaussians.opacities, 0.5, atol=1e-6)
     assert not untrained[gaussians.active & (gaussians.kappa > 0)].any()
-    assert untrained[~gaussians.active].all() == (phase is ActivePhase.ACTIVE_ONLY)
+    assert untrained[~gaussians.active].all() == active_only
 
 
 def test_a_frame_without_depth_is_skipped_and_counted() -> None:

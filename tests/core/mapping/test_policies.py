@@ -17,7 +17,7 @@ from gausslite.mapping.policies import (
     disable,
     policy,
 )
-from gausslite.mapping.settings import ActivePhase, Components, KeyframeSettings, MapperSettings
+from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights
@@ -64,7 +64,7 @@ def test_the_paper_policy_has_the_settings_of_the_paper() -> None:
     assert (keyframes.every, keyframes.window, keyframes.long_term_keyframes) == (5, 24, 0)
     assert (keyframes.roi_context_weight, keyframes.depth_edge_px, keyframes.rotates) == (0.0, 0, False)
     assert (optimization.warmup_iterations, optimization.active_iterations, optimization.active_views) == (2, 6, 1)
-    assert optimization.active_phase is ActivePhase.ACTIVE_ONLY
+    assert optimization.active_only
     assert optimization.loss == LossWeights(colour=0.8, depth=1.0, ssim=0.2, normalise_by_image=False)
     assert (optimization.ema_updates, optimization.adam) == (0.0, AdamSettings())
     assert optimization.adam.decay_after_updates == math.inf
