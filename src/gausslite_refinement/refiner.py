@@ -44,11 +44,10 @@ class RefinementWorker:
             return WorkDone(is_changed=False, is_due=True)
         if engine.store.is_shared or sum(engine.store.totals(name).gaussians for name in sources) > _MAX_JUDGED:
             return WorkDone(is_changed=False, is_due=False)
-        names = spread_of(engine.keyframes.names())
+        names = spread_of(engine.keyframes.pixels())
         vote = ResidualVote({name: engine.maps.union_map(name) for name in sources if names and len(sources) > 1})
         if vote.is_contested:
-            one_by_one = (engine.keyframes.decode(engine.keyframes.read([name])) for name in names)
-            frames = [reduced(own.frame) for decoded in one_by_one for own in engine.in_fused_frame(decoded)]
+            frames = [reduced(own.frame) for own in engine.decoded_keyframes(names)]
             for _ in vote.steps(frames, self._create_rasterizer()):
                 if self._is_closed.is_set():
                     return WorkDone(is_changed=False, is_due=True)
