@@ -36,9 +36,9 @@ class RefinementWorker:
 
     def judge(self, engine: FusionEngine) -> WorkDone:
         """Let maps win by their error in the keyframes, if there are any; it waits for a refinement that runs."""
-        return self._worker.submit(self._judge, engine).result()
+        return self._worker.submit(self._judge, engine, self._is_closed).result()
 
-    def _judge(self, engine: FusionEngine) -> WorkDone:
+    def _judge(self, engine: FusionEngine, cancelled: Event) -> WorkDone:
         revision, sources = engine.maps.revision(), engine.store.agents()
         if engine.has_background_work:
             return WorkDone(is_changed=False, is_due=True)
@@ -49,7 +49,7 @@ class RefinementWorker:
         if vote.is_contested:
             frames = [reduced(own.frame) for own in engine.decoded_keyframes(names)]
             for _ in vote.steps(frames, self._create_rasterizer()):
-                if self._is_closed.is_set():
+                if cancelled.is_set() or self._is_closed.is_set():
                     return WorkDone(is_changed=False, is_due=True)
         engine.maps.prefer(vote.result())
         return_free_memory()
@@ -72,8 +72,12 @@ class RefinementWorker:
             progress_notifier.notify()
 
         def work() -> None:
-            self._judge(engine)
+            self._judge(engine, cancelled)
+            if cancelled.is_set():
+                return
             vote = RefineInput.of(engine)
+            if cancelled.is_set():
+                return
             refinement = Refinement(vote, self._create_rasterizer(), settings)
             for line in refinement.left_out:
                 _log.warning("refinement: left out, because they disagree with the vote: %s", line)

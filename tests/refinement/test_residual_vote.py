@@ -1,7 +1,10 @@
 """The vote by what each map explains of the keyframes: who wins, when, and what stays."""
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
+from threading import Event
+from typing import Any
 
 import pytest
 from fusion_running import CAMERA, GRID, fusion_server, keys, make_subset, photograph
@@ -14,9 +17,11 @@ from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig
+from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import PREFERRED
+from gausslite.render.rasterizer import Rendering
 from gausslite.wire.convert import decode_frame, frame_to_message
 from gausslite_refinement import refine_input
 from gausslite_refinement.refine_input import RefineInput, within_memory
@@ -185,6 +190,33 @@ def test_only_the_chosen_keyframes_are_decoded(monkeypatch: pytest.MonkeyPatch) 
     add_keyframes(engine, "good")
     monkeypatch.setattr(refine_input, "_MAX_PIXELS", CAMERA.width_px * CAMERA.height_px)
     assert [keyframe.frame.index for keyframe in RefineInput.of(engine).keyframes] == decoded == [1]
+
+
+def test_a_cancelled_refinement_judges_no_further_map() -> None:
+    begun, may_end, cameras = Event(), Event(), list[Any]()
+
+    class SlowRasterizer(ReferenceRasterizer):
+        def forward(self, *arguments: Any, **options: Any) -> Rendering:
+            cameras.append(arguments[1])
+            begun.set()
+            assert may_end.wait(60)
+            return super().forward(*arguments, **options)
+
+    worker, engine = RefinementWorker(SlowRasterizer), contested(SqliteStore())
+    add_keyframes(engine)
+
+    async def cancel() -> None:
+        progress = asyncio.ensure_future(anext(worker.run(engine, RefineSettings(iterations=1))))
+        assert await asyncio.to_thread(begun.wait, 60)
+        progress.cancel()
+        await asyncio.wait([progress])
+
+    asyncio.run(cancel())
+    may_end.set()
+    # it waits for the refinement
+    worker.judge(started(SqliteStore()))
+    assert len(cameras) == 2
+    worker.close()
 
 
 def test_damaged_preferences_are_an_error() -> None:
