@@ -324,7 +324,7 @@ class UnknownFrames:
         samples = {ids[index]: before[ids[index]] for index in chosen if ids[index] in before}
         for index in chosen:
             if ids[index] not in samples:
-                for found in team.keyframes.decode(team.keyframes.read([(agent_id, index)])):
+                for found in team.keyframes.read(agent_id, index):
                     samples[ids[index]] = keyframe_samples(found.frame)
         self._samples_of_keyframe[agent_id] = samples
         seen = _one_of_each_cube(SurfaceSamples.concatenate([*samples.values()])).moved(alignment.T_fused_agent)

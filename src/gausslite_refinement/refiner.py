@@ -36,21 +36,20 @@ class RefinementWorker:
 
     def judge(self, engine: FusionEngine) -> WorkDone:
         """Let maps win by their error in the keyframes, if there are any; it waits for a refinement that runs."""
-        return self._worker.submit(self._judge, engine).result()
+        return self._worker.submit(self._judge, engine, self._is_closed).result()
 
-    def _judge(self, engine: FusionEngine) -> WorkDone:
+    def _judge(self, engine: FusionEngine, cancelled: Event) -> WorkDone:
         revision, sources = engine.maps.revision(), engine.store.agents()
         if engine.has_background_work:
             return WorkDone(is_changed=False, is_due=True)
         if engine.store.is_shared or sum(engine.store.totals(name).gaussians for name in sources) > _MAX_JUDGED:
             return WorkDone(is_changed=False, is_due=False)
-        names = spread_of(engine.keyframes.names())
+        names = spread_of(engine.keyframes.pixels())
         vote = ResidualVote({name: engine.maps.union_map(name) for name in sources if names and len(sources) > 1})
         if vote.is_contested:
-            one_by_one = (engine.keyframes.decode(engine.keyframes.read([name])) for name in names)
-            frames = [reduced(own.frame) for decoded in one_by_one for own in engine.in_fused_frame(decoded)]
+            frames = [reduced(own.frame) for own in engine.decoded_keyframes(names)]
             for _ in vote.steps(frames, self._create_rasterizer()):
-                if self._is_closed.is_set():
+                if cancelled.is_set() or self._is_closed.is_set():
                     return WorkDone(is_changed=False, is_due=True)
         engine.maps.prefer(vote.result())
         return_free_memory()
@@ -73,8 +72,12 @@ class RefinementWorker:
             progress_notifier.notify()
 
         def work() -> None:
-            self._judge(engine)
+            self._judge(engine, cancelled)
+            if cancelled.is_set():
+                return
             vote = RefineInput.of(engine)
+            if cancelled.is_set():
+                return
             refinement = Refinement(vote, self._create_rasterizer(), settings)
             for line in refinement.left_out:
                 _log.warning("refinement: left out, because they disagree with the vote: %s", line)

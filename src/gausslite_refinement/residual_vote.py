@@ -19,6 +19,7 @@ from gausslite.domain.pose import inverse
 from gausslite.domain.voxels import VoxelBatch, replace_voxels
 from gausslite.fusion.vote import PREFERRED, Preferred, fuse, source_hashes
 from gausslite.render.rasterizer import RGB, Rasterizer, gaussians_to_rows, reduced_dilation_px2
+from gausslite_refinement.refine_input import evenly
 
 _PER_AGENT, _IN_ALL, _WIDTH_PX = 8, 32, 320
 """Keyframes of each agent and of all, and the width to which they are reduced."""
@@ -30,8 +31,7 @@ blending, that both need in the keyframes. With 1 as the share, noise decides: a
 def spread_of(names: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
     """Return the names of some of each agent's keyframes, evenly over its mission. names: sorted."""
     by_agent = [list(own) for _, own in itertools.groupby(names, lambda name: name[0])]
-    most = max(1, min(_PER_AGENT, _IN_ALL // max(1, len(by_agent))))
-    return [own[len(own) * i // min(most, len(own))] for own in by_agent for i in range(min(most, len(own)))]
+    return [name for own in by_agent for name in evenly(own, min(_PER_AGENT, _IN_ALL // len(by_agent)))]
 
 
 class ResidualVote:

@@ -416,6 +416,17 @@ def test_a_keyframe_that_a_declared_frame_moves_out_of_range_is_left_out() -> No
     assert moved.frame.T_world_camera[0, 3] == 9000.0
 
 
+def test_a_keyframe_of_a_pose_and_a_declared_frame_that_are_hardly_rigid_is_moved() -> None:
+    engine = aligning()
+    engine.join("bee", ANYTHING)
+    T = np.diag([1.0047, 1.0, 1.0, 1.0])
+    T[0, 3], T[3, 0] = 100.0, 9e-7
+    engine.declare_frame("bee", T)
+    seen = Frame(0, 0, np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), Camera(8, 8, 4, 4, 8, 8), T)
+    [moved] = engine.in_fused_frame([AgentKeyframe("bee", seen)])
+    assert moved.frame.T_world_camera == pytest.approx(wrong_frame((200.47, 0.0, 0.0), 0.0), abs=1e-9)
+
+
 def test_moved_gaussians_keep_their_shape() -> None:
     flat = replace(corner(0, count=10), scales_m=np.tile(np.float32([0.1, 0.01, 0.001]), (10, 1)))
     T = wrong_frame((1.0, 2.0, 3.0), 70.0)

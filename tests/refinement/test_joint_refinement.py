@@ -156,17 +156,16 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     for index, data in ((3, b"first"), (1, b"1"), (2, b"2"), (3, b"again")):
         pool.add(encoded("ant", index, data))
     pool.add(encoded("aardvark", 7))
-    names = pool.names()
-    assert pool.read(names) == [("ant", b"2"), ("ant", b"again")]
-    assert names == [("aardvark", 7), ("ant", 2), ("ant", 3)]
+    assert (pool.find("ant", 2), pool.find("ant", 3)) == (b"2", b"again")
+    assert list(pool.pixels()) == [("aardvark", 7), ("ant", 2), ("ant", 3)]
     assert (len(pool), pool.indices("ant"), pool.indices("bee")) == (3, (2, 3), ())
     # the store keeps them for the next process
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
     pool.begin_map("ant", store.begin_map("ant"))
-    assert (len(pool), pool.names()) == (1, [("aardvark", 7)])
+    assert (len(pool), pool.pixels()) == (1, {("aardvark", 7): 18 * 24})
     # after a restart too
     pool = KeyframePool(store, limits)
-    assert (len(pool), pool.names(), pool.has_former) == (1, [("aardvark", 7)], True)
+    assert (len(pool), pool.pixels(), pool.has_former) == (1, {("aardvark", 7): 18 * 24}, True)
     assert [pool.remove_next() for _ in range(3)] == [True, True, False]
     assert {name: list(sizes) for name, sizes in store.keyframe_sizes().items()} == {"aardvark": [7]}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
@@ -202,6 +201,10 @@ def test_a_keyframe_stored_without_its_place_is_the_newest_and_a_damaged_order_i
     # the server was killed before it stored the order
     store.save_keyframe("ant", 2, b"2")
     assert KeyframePool(store, Quotas()).find("ant") == b"2"
+    assert KeyframePool(store, Quotas(keyframe_pixels=9)).pixels() == {("ant", 2): 9, ("ant", 5): 18 * 24}
+    # an earlier version stored no pixels
+    store.save_record("ant", ORDER_RECORD, b"[[5, 5]]")
+    assert KeyframePool(store, Quotas(keyframe_pixels=9)).pixels() == {("ant", 2): 9, ("ant", 5): 9}
     store.save_record("ant", ORDER_RECORD, b"{")
     pytest.raises(CodecError, KeyframePool, store, Quotas()).match("stored order of keyframes")
 
@@ -234,7 +237,7 @@ def test_a_new_map_waits_for_no_keyframe_that_is_written_with_pauses(monkeypatch
         may_end.set()
         writing.result(60)
     # it belongs to the former map, too
-    assert (pool.names(), pool.remove_next(), pool.remove_next()) == ([], True, False)
+    assert (pool.pixels(), pool.remove_next(), pool.remove_next()) == ({}, True, False)
     assert store.keyframe_sizes() == {}
 
 
@@ -249,4 +252,5 @@ def test_keyframes_that_are_not_selected_are_deleted() -> None:
 def test_a_damaged_keyframe_is_named() -> None:
     pool = KeyframePool(SqliteStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24), decode_frame)
     pool.add(encoded("ant", 1, b"\xff\xff"))
-    pytest.raises(CodecError, pool.decode, pool.read(pool.names())).match("expected an EncodedFrame")
+    pytest.raises(CodecError, pool.read, "ant", 1).match("stored keyframe 1 of ant: frame: expected an EncodedFrame")
+    assert pool.read("ant", 2) == []

@@ -1,7 +1,10 @@
 """The vote by what each map explains of the keyframes: who wins, when, and what stays."""
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,16 +15,20 @@ from waiting import wait_until
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import CodecError
+from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import RoiSubset, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, MissionConfig
+from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import PREFERRED
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import gaussians_to_rows
+from gausslite.render.rasterizer import Rendering, gaussians_to_rows
 from gausslite.wire.convert import decode_frame, frame_to_message
+from gausslite_refinement import refine_input
+from gausslite_refinement.refine_input import RefineInput, within_memory
 from gausslite_refinement.refiner import RefinementWorker
 from gausslite_refinement.residual_vote import ResidualVote, reduced, spread_of
 
@@ -160,6 +167,73 @@ def test_some_keyframes_of_each_agent_judge() -> None:
     assert spread_of(names) == [*(("ant", i) for i in range(0, 40, 5)), ("bee", 7)]
     assert len(spread_of(sorted((f"agent-{i % 20}", i) for i in range(200)))) == 20
     assert spread_of([]) == []
+
+
+def test_a_keyframe_that_cannot_be_read_is_left_out_by_name(
+    worker: RefinementWorker, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine = contested(SqliteStore())
+    add_keyframes(engine)
+    engine.keyframes.add(EncodedKeyframe("good", 7, 7, 1, b"of another version"))
+    assert worker.judge(engine).is_changed
+    assert [keyframe.frame.index for keyframe in RefineInput.of(engine).keyframes] == [1, 2]
+    assert [line[:26] for line in caplog.messages] == ["stored keyframe 7 of good:"] * 2
+
+
+def test_the_keyframes_of_a_refinement_fit_into_memory() -> None:
+    full, small = 1920 * 1080, 640 * 480
+    names = [(agent, index) for agent in ("ant", "bee") for index in range(48)]
+    assert within_memory(dict.fromkeys(names, small)) == names
+    assert within_memory(dict.fromkeys(names[:64], full)) == names[:64]
+    chosen = within_memory(dict.fromkeys(names, full))
+    assert [index for agent, index in chosen if agent == "bee"] == [48 * i // 32 for i in range(32)]
+    assert len(chosen) == 64
+    # each counts as the largest of its agent, so that no choice of them exceeds the limit
+    assert len(within_memory({name: full if name[1] % 2 else small for name in names})) == 64
+    crowd = [(f"agent-{number:02}", index) for number in range(80) for index in range(9)]
+    assert within_memory(dict.fromkeys(crowd, full)) == crowd[::9]
+    assert within_memory({}) == []
+
+
+def test_only_the_chosen_keyframes_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[int] = []
+
+    def decode(data: bytes) -> Frame:
+        decoded.append(decode_frame(data).index)
+        return decode_frame(data)
+
+    engine = FusionEngine(SqliteStore(), FusionSettings(GRID), decode_keyframe=decode)
+    contribute(engine, make_subset("good", 1, CELLS))
+    add_keyframes(engine, "good")
+    monkeypatch.setattr(refine_input, "_MAX_PIXELS", CAMERA.width_px * CAMERA.height_px)
+    assert [keyframe.frame.index for keyframe in RefineInput.of(engine).keyframes] == decoded == [1]
+
+
+def test_a_cancelled_refinement_judges_no_further_map() -> None:
+    begun, may_end, cameras = Event(), Event(), list[Any]()
+
+    class SlowRasterizer(ReferenceRasterizer):
+        def forward(self, *arguments: Any, **options: Any) -> Rendering:
+            cameras.append(arguments[1])
+            begun.set()
+            assert may_end.wait(60)
+            return super().forward(*arguments, **options)
+
+    worker, engine = RefinementWorker(SlowRasterizer), contested(SqliteStore())
+    add_keyframes(engine)
+
+    async def cancel() -> None:
+        progress = asyncio.ensure_future(anext(worker.run(engine, RefineSettings(iterations=1))))
+        assert await asyncio.to_thread(begun.wait, 60)
+        progress.cancel()
+        await asyncio.wait([progress])
+
+    asyncio.run(cancel())
+    may_end.set()
+    # it waits for the refinement
+    worker.judge(started(SqliteStore()))
+    assert len(cameras) == 2
+    worker.close()
 
 
 def test_damaged_preferences_are_an_error() -> None:

@@ -52,8 +52,8 @@ def inverse(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
 def orthonormal(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
     """Return the rigid transform with the nearest rotation. It removes rounding errors of a long product."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
-    out = T.copy()
-    out[:3, :3] = U @ Vt
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = U @ Vt, T[:3, 3]
     return out
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from threading import Lock
@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import GaussLiteError, MismatchError, QuotaError, UnavailableError
+from gausslite.domain.errors import CodecError, GaussLiteError, MismatchError, QuotaError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
@@ -373,6 +373,14 @@ class FusionEngine:
         frames, unused = self.frames.transforms(), self.frames.unused
         moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in unused)
         return [keyframe for keyframe in moved if keyframe is not None]
+
+    def decoded_keyframes(self, names: Iterable[tuple[str, int]]) -> Iterator[AgentKeyframe]:
+        """Yield these keyframes as `in_fused_frame`, one decoded at a time. Those that cannot be read are logged."""
+        for name in names:
+            try:
+                yield from self.in_fused_frame(self.keyframes.read(*name))
+            except CodecError as error:
+                _log.warning("%s; it is left out", error)
 
     def store_refined(self, gaussians: Gaussians, revision: int, sources: tuple[str, ...]) -> None:
         """Store the result of a refinement of the vote at this revision, shaped by these agents' keyframes.

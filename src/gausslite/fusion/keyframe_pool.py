@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame
+from gausslite.domain.pose import orthonormal
 from gausslite.fusion.epochs import is_former
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore
@@ -50,6 +51,7 @@ class EncodedKeyframe:
 
 class _Stored(NamedTuple):
     capture_time_ns: int
+    pixels: int
     size_bytes: int
     keyframe_id: int
 
@@ -76,7 +78,7 @@ class KeyframePool:
         sizes_bytes = store.keyframe_sizes()
         # of maps that are not the agents' present ones
         self._former = {name: list(sizes_bytes.pop(name)) for name in filter(is_former, list(sizes_bytes))}
-        self._stored = _in_order(sizes_bytes, store.records(ORDER_RECORD), self._ids)
+        self._stored = _in_order(sizes_bytes, store.records(ORDER_RECORD), quotas.keyframe_pixels, self._ids)
 
     def __len__(self) -> int:
         return sum(map(len, list(self._stored.values())))
@@ -102,13 +104,13 @@ class KeyframePool:
         before = stored.get(keyframe.index)
         if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
             del stored[keyframe.index]
-        stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data), next(self._ids))
+        stored[keyframe.index] = _Stored(keyframe.capture_time_ns, keyframe.pixels, len(keyframe.data), next(self._ids))
         wanted = {*(selected or stored), keyframe.index}
         kept = self._newest_within_limits({index: own for index, own in stored.items() if index in wanted})
         if len(kept) < len(stored):
             self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
         self._stored[keyframe.agent_id] = kept
-        order = [(index, own.capture_time_ns) for index, own in kept.items()]
+        order = [(index, own.capture_time_ns, own.pixels) for index, own in kept.items()]
         self._store.save_record(keyframe.agent_id, ORDER_RECORD, json.dumps(order).encode())
 
     def indices(self, agent_id: str) -> tuple[int, ...]:
@@ -168,35 +170,37 @@ class KeyframePool:
             kept.append(index)
         return {index: stored[index] for index in reversed(kept)}
 
-    def names(self) -> list[tuple[str, int]]:
-        """Return the agent id and the frame index of all keyframes, sorted."""
-        return [(agent_id, index) for agent_id, own in sorted(self._stored.items()) for index in sorted(own)]
+    def pixels(self) -> dict[tuple[str, int], int]:
+        """Return the number of pixels of all keyframes by agent id and frame index, sorted."""
+        stored = sorted(self._stored.items())
+        return {(agent_id, index): own[index].pixels for agent_id, own in stored for index in sorted(own)}
 
-    def read(self, names: Iterable[tuple[str, int]]) -> list[tuple[str, bytes]]:
-        """Return the agent id and the bytes of those of these keyframes that still exist."""
-        found = ((agent_id, self._store.keyframe(agent_id, index)) for agent_id, index in names)
-        return [(agent_id, data) for agent_id, data in found if data]
-
-    def decode(self, encoded: Iterable[tuple[str, bytes]]) -> list[AgentKeyframe]:
-        """Return these keyframes decoded. Raises CodecError for damaged ones."""
+    def read(self, agent_id: str, index: int) -> list[AgentKeyframe]:
+        """Return this keyframe decoded, if it still exists. Raises CodecError for a damaged one, StorageError."""
+        data = self._store.keyframe(agent_id, index)
         try:
-            return [AgentKeyframe(agent_id, self._decode(data)) for agent_id, data in encoded]
+            return [AgentKeyframe(agent_id, self._decode(data))] if data else []
         except GaussLiteError as error:
-            raise CodecError(f"stored keyframe: {error}") from error
+            raise CodecError(f"stored keyframe {index} of {agent_id}: {error}") from error
 
 
 def _in_order(
-    sizes_bytes: Mapping[str, Mapping[int, int]], orders: Mapping[str, bytes], ids: Iterator[int]
+    sizes_bytes: Mapping[str, Mapping[int, int]], orders: Mapping[str, bytes], most_pixels: int, ids: Iterator[int]
 ) -> dict[str, dict[int, _Stored]]:
-    """Return the keyframes in the order in which they were received; those without a place are the last."""
+    """Return the keyframes in the order in which they were received; those without a place are the last.
+
+    most_pixels: of those that an earlier version stored, without their pixels.
+    """
     stored = {}
     for agent_id, sizes in sizes_bytes.items():
         try:
-            times_ns = {int(index): int(time_ns) for index, time_ns in json.loads(orders.get(agent_id, b"[]"))}
+            rows = [[*map(int, row), most_pixels][:3] for row in json.loads(orders.get(agent_id, b"[]"))]
+            known = {index: (time_ns, pixels) for index, time_ns, pixels in rows}
         except (TypeError, ValueError, RecursionError) as error:
             raise CodecError(f"stored order of keyframes: expected its JSON, got other bytes ({error})") from error
-        ordered = [*(index for index in times_ns if index in sizes), *sorted(sizes.keys() - times_ns.keys())]
-        stored[agent_id] = {index: _Stored(times_ns.get(index, -1), sizes[index], next(ids)) for index in ordered}
+        ordered = [*(index for index in known if index in sizes), *sorted(sizes.keys() - known.keys())]
+        unknown = -1, most_pixels
+        stored[agent_id] = {index: _Stored(*known.get(index, unknown), sizes[index], next(ids)) for index in ordered}
     return stored
 
 
@@ -205,7 +209,8 @@ def in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray
     T_fused_agent = frames.get(keyframe.agent_id)
     if T_fused_agent is None:
         return keyframe
-    pose = T_fused_agent @ keyframe.frame.T_world_camera
+    # both are rigid within a tolerance, which their product may exceed
+    pose = orthonormal(T_fused_agent @ keyframe.frame.T_world_camera)
     if np.abs(pose[:3, 3]).max() > MAX_COORDINATE_M:
         return None
     return replace(keyframe, frame=replace(keyframe.frame, T_world_camera=pose))
