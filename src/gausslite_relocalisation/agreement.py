@@ -18,7 +18,7 @@ from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
 from gausslite.mapping.free_space import DepthView
-from gausslite.mapping.seeding import RenderedView
+from gausslite.render.rasterizer import Rendering
 from gausslite_places.verification import blurred_luminance, reduced, texture_correlation
 
 _WIDTH_PX, _POINT_STEP = 160, 2
@@ -41,7 +41,7 @@ class Agreement(Enum):
 
 
 def compare(
-    frame: Frame, rendered: RenderedView | None, earlier: Sequence[Frame], only_contradiction: bool = False
+    frame: Frame, rendered: Rendering | None, earlier: Sequence[Frame], only_contradiction: bool = False
 ) -> Agreement:
     """Compare a frame with the map rendered from its pose and with earlier frames; unknown without a rendering.
 
@@ -51,7 +51,7 @@ def compare(
         return Agreement.UNKNOWN
     camera = frame.camera.narrower(_WIDTH_PX)
     depth_m, alpha, map_m = (
-        _reduced_image(image, camera) for image in (frame.depth_m, rendered.alpha, rendered.depth_m)
+        _reduced_image(image, camera) for image in (frame.depth_m, rendered.alpha, rendered.expected_depth_m())
     )
     measured = depth_m > 0
     covered = measured & (alpha > _OPAQUE_ALPHA)

@@ -18,7 +18,6 @@ from gausslite.domain.frame import Frame, FrameId
 from gausslite.domain.pose import orthonormal, rotation_angle_deg, translation_m
 from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
 from gausslite.mapping.mapper import FrameView, GaussianMapper
-from gausslite.mapping.seeding import RenderedView
 from gausslite.mission.localisation_monitor import Admission, LocalisationMonitor, LocalisationState
 from gausslite.mission.prior_map import PriorMap
 from gausslite.process import return_free_memory
@@ -229,7 +228,7 @@ class FrameMonitor(LocalisationMonitor):
         T, rendered = mapper.poses.T_corrected_odometry, None
         placed = frame if T is None else replace(frame, T_world_camera=orthonormal(T @ frame.T_world_camera))
         if mapper.table.count:
-            rendered = RenderedView.from_rendering(mapper.render(frame.camera, placed.T_world_camera, frame.motion))
+            rendered = mapper.render(frame.camera, placed.T_world_camera, frame.motion)
         return compare(placed, rendered, self._earlier)
 
     def _by_images(self, frame: Frame, mapper: GaussianMapper) -> Float64[ndarray, "4 4"] | None:

@@ -38,7 +38,7 @@ from gausslite.mapping.pager import MapPager
 from gausslite.mapping.pose_corrector import PoseCorrector
 from gausslite.mapping.pose_estimation import RefinementSettings, open_refiner
 from gausslite.mapping.poses import PoseTable
-from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
+from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.stages import SkippableStage, Stage, StageScheduler
@@ -75,7 +75,7 @@ class FrameView:
     """A frame to map, and what the map shows from its pose."""
 
     frame: Frame
-    rendered: RenderedView | None = None  # None if the map is empty or was not rendered
+    rendered: Rendering | None = None  # None if the map is empty or was not rendered
 
 
 class GaussianMapper:
@@ -146,8 +146,7 @@ class GaussianMapper:
         if self.table.count == 0 or scheduler.skips(SkippableStage.SEEDING):
             return FrameView(frame)
         with scheduler.timing(Stage.RENDERING):
-            rendering = self._render(frame.camera, frame.T_world_camera, frame.motion)
-            return FrameView(frame, RenderedView.from_rendering(rendering))
+            return FrameView(frame, self._render(frame.camera, frame.T_world_camera, frame.motion))
 
     def leave_out_moving(self, view: FrameView, scheduler: StageScheduler) -> FrameView:
         """Return the view without the things that move; a keyframe loses what has moved since."""
@@ -406,14 +405,14 @@ class GaussianMapper:
     def _window_view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self.rasterizer, self.settings.keyframes)
 
-    def _seed(self, keyframe: Keyframe, rendered: RenderedView | None, scheduler: StageScheduler) -> int:
+    def _seed(self, keyframe: Keyframe, rendered: Rendering | None, scheduler: StageScheduler) -> int:
         """Add Gaussians where the map does not explain the frame (Sec. III-C); return how many."""
         if scheduler.skips(SkippableStage.SEEDING):
             return 0
         frame, table = keyframe.frame, self.table
         # rendered from the pose before refinement
         if (rendered is None or keyframe.recorded is not None) and table.count:
-            rendered = RenderedView.from_rendering(self._render(frame.camera, frame.T_world_camera, frame.motion))
+            rendered = self._render(frame.camera, frame.T_world_camera, frame.motion)
         with scheduler.timing(Stage.SEEDING):
             share = self.settings.seeding.background_share
             max_active = round((1.0 - share) * table.capacity) if share > 0 else None

@@ -38,27 +38,14 @@ _MIN_ROI_ROOM = 0.05
 """Lowest density of ROI seeds relative to that of an empty map."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RenderedView:
-    """The map from a frame's pose: alpha in [0, 1], expected depth in metres (0 where alpha is low), and colours."""
-
-    alpha: Float32[ndarray, "h w"]
-    depth_m: Float32[ndarray, "h w"]
-    rgb: Float32[ndarray, "h w 3"]  # as rendered, in [0, 1]
-
-    @classmethod
-    def from_rendering(cls, rendering: Rendering) -> RenderedView:
-        """Return alpha and expected depth of a rendering."""
-        return cls(rendering.alpha, rendering.expected_depth_m(), rendering.rgb)
-
-
-def rendered_behind(frame: Frame, rendered: RenderedView, depth_error_factor: float) -> Bool[ndarray, "h w"]:
+def rendered_behind(frame: Frame, rendered: Rendering, depth_error_factor: float) -> Bool[ndarray, "h w"]:
     """Return the pixels rendered behind the measured depth by more than depth_error_factor times the median error.
 
     The median of the absolute depth error is taken over every fourth row and column.
     """
-    comparable = (frame.depth_m > 0) & (rendered.depth_m > 0)
-    behind_m = rendered.depth_m - frame.depth_m
+    rendered_m = rendered.expected_depth_m()
+    comparable = (frame.depth_m > 0) & (rendered_m > 0)
+    behind_m = rendered_m - frame.depth_m
     sample = (slice(None, None, _MEDIAN_STEP_PX), slice(None, None, _MEDIAN_STEP_PX))
     errors_m = np.abs(behind_m[sample][comparable[sample]])  # a sample: the median needs no more
     # the median: what the map really lacks does not raise the limit
@@ -117,7 +104,7 @@ class SeedingContext:
     """State of the map before seeding."""
 
     free_slots: int  # Gaussians that still fit under the cap
-    rendered: RenderedView | None  # the map rendered from the frame's pose, None if the map is empty
+    rendered: Rendering | None  # the map rendered from the frame's pose, None if the map is empty
     active_means_m: Float32[ndarray, "n 3"]  # means of the active Gaussians
     max_active: int | None = None  # how many may be active; None: any number
 

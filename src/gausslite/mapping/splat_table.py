@@ -153,6 +153,11 @@ class SplatTable:
         return self._columns["anchor"][: self.count]
 
     @property
+    def update_counts(self) -> Float32[ndarray, " n"]:
+        """Number of Adam updates of each Gaussian."""
+        return self.rows[:, UPDATE_COUNT]
+
+    @property
     def means_m(self) -> Float32[ndarray, "n 3"]:
         """Means in metres."""
         return self.rows[:, MEAN]
@@ -229,7 +234,7 @@ class SplatTable:
 
     def adopt(self, ids: Int64[ndarray, " m"], updates: int, beta2: float) -> None:
         """Give these Gaussians a number of updates, and the median second moment of trained rows, if there are any."""
-        counts = self.rows[:, UPDATE_COUNT].astype(np.float64)
+        counts = self.update_counts.astype(np.float64)
         trained = np.flatnonzero(counts >= min(_UPDATES_OF_TRAINED, max(counts.max(), 1.0)))
         if len(ids) == 0 or len(trained) == 0:
             return

@@ -26,7 +26,7 @@ from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
 from gausslite.mapping.view_rotation import ViewRotation
 from gausslite.mapping.window_view import WindowView
-from gausslite.render.rasterizer import UPDATE_COUNT, AdamSettings, Rasterizer, Subset, UpdateCounter
+from gausslite.render.rasterizer import AdamSettings, Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
 """Steps behind the running mean; no iteration is released before that many."""
@@ -221,7 +221,7 @@ class Trainer:
         do dozens of steps on the first view, which an iteration with few views repeats on a new map.
         """
         table, self._active_views = self._table, self._settings.optimization.active_views
-        is_loaded, counts = table.anchor == NO_ANCHOR, table.rows[:, UPDATE_COUNT]
+        is_loaded, counts = table.anchor == NO_ANCHOR, table.update_counts
         if not is_loaded.any():
             return
         self._active_views = min(self._active_views, sum(view.shows_roi for view in views))

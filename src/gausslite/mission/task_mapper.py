@@ -315,7 +315,9 @@ class TaskMapper:
         if view.frame.defect:
             return self._skip_defect(frame, MOVING)
         with self._scheduler.timing(Stage.RELEVANCE):  # w(u, v), Sec. III-B
-            estimate = self._estimator.estimate(view.frame, None if view.rendered is None else view.rendered.depth_m)
+            estimate = self._estimator.estimate(
+                view.frame, None if view.rendered is None else view.rendered.expected_depth_m()
+            )
         self._detected = estimate.detected or self._detected
         lag_frames = self._apply_delayed(estimate.delayed)  # before the frame: its training uses that region
         reevaluation = self._reevaluate_keyframes()  # a new task first needs what the map has of it

@@ -197,7 +197,7 @@ def test_expected_depth_is_the_depth_of_the_wall() -> None:
     frame = wall_frame(0, SIZE)
     view = mapper.look(frame, CountedScheduler()).rendered
     assert view is not None
-    depth_m = view.depth_m
+    depth_m = view.expected_depth_m()
     assert (depth_m > 0).mean() > 0.5
     assert np.median(depth_m[depth_m > 0]) == pytest.approx(2.0, abs=0.05)
 

@@ -46,7 +46,7 @@ def test_the_map_renders_what_the_moving_camera_sees() -> None:
     assert rendered is not None
     seen = rendered.alpha > 0.8
     assert seen.mean() > 0.5
-    error_m = (rendered.depth_m - frame.depth_m)[seen]
+    error_m = (rendered.expected_depth_m() - frame.depth_m)[seen]
     assert np.median(np.abs(error_m)) < 0.01
     top_to_bottom = error_m[: len(error_m) // 4].mean() - error_m[-len(error_m) // 4 :].mean()
     assert abs(top_to_bottom) < 0.02

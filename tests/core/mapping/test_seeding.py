@@ -5,7 +5,7 @@ import pytest
 from mapping_scenes import middle_relevance, rendering_of, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, rendered_behind, undersampled_roi
+from gausslite.mapping.seeding import Seeder, SeedingContext, rendered_behind, undersampled_roi
 from gausslite.mapping.settings import Components, SeedingSettings
 
 NO_MEANS = np.zeros((0, 3), np.float32)
@@ -78,7 +78,7 @@ def test_later_frames_seed_only_what_the_map_does_not_explain() -> None:
     frame = wall_frame()
     alpha = np.ones((48, 64))
     alpha[:, :10] = 0.3
-    state = SeedingContext(1_000_000, RenderedView.from_rendering(rendering_of(alpha, frame.depth_m)), NO_MEANS)
+    state = SeedingContext(1_000_000, rendering_of(alpha, frame.depth_m), NO_MEANS)
     background = seeder().seed(frame, RelevanceMap.empty(48, 64), state).background
     assert 0 < len(background) <= 10_000 * 64 * 48 / (640 * 480)
     assert (background.means_m[:, 0] / 2.0 * 64 + 32 < 10).all()
@@ -115,7 +115,7 @@ def test_pixels_rendered_behind_the_measured_surface_are_found_but_not_those_in_
     rendered_m = np.full((48, 64), 2.01, np.float32)
     rendered_m[10:14, 20:24] = 4.0
     rendered_m[30:34, 20:24] = 1.0
-    found = rendered_behind(frame, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), rendered_m)), 40.0)
+    found = rendered_behind(frame, rendering_of(np.ones((48, 64)), rendered_m), 40.0)
     expected = np.zeros((48, 64), np.bool_)
     expected[10:14, 20:24] = True
     np.testing.assert_array_equal(found, expected)
@@ -138,7 +138,7 @@ def test_a_region_is_undersampled_without_enough_active_gaussians_on_its_surface
 def test_background_that_becomes_the_region_is_seeded() -> None:
     frame = wall_frame()
     state = SeedingContext(
-        1_000_000, RenderedView.from_rendering(rendering_of(np.ones((48, 64)), frame.depth_m)), NO_MEANS
+        1_000_000, rendering_of(np.ones((48, 64)), frame.depth_m), NO_MEANS
     )
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
