@@ -199,8 +199,7 @@ def _in_order(
         except (TypeError, ValueError, RecursionError) as error:
             raise CodecError(f"stored order of keyframes: expected its JSON, got other bytes ({error})") from error
         ordered = [*(index for index in known if index in sizes), *sorted(sizes.keys() - known.keys())]
-        unknown = -1, most_pixels
-        stored[agent_id] = {index: _Stored(*known.get(index, unknown), sizes[index], next(ids)) for index in ordered}
+        stored[agent_id] = {i: _Stored(*known.get(i, (-1, most_pixels)), sizes[i], next(ids)) for i in ordered}
     return stored
 
 
