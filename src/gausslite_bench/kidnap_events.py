@@ -16,7 +16,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mission.settings import MissionSettings, default_policy
-from gausslite_bench.cli.study_options import names_among
+from gausslite_bench.cli.study_options import one_or_more
 from gausslite_bench.quality.real_scenes import REAL_CAMERA
 
 _COVERED_NS = 10_000_000_000
@@ -85,7 +85,7 @@ class KidnapSettings:
     source: str = option("sim:home", "the recording", metavar="ADDRESS")
     elsewhere: str = option("sim:home-2", "another one, of a place that the map does not have", metavar="ADDRESS")
     events: tuple[str, ...] = option(
-        tuple(EVENTS), f"among {', '.join(EVENTS)}", metavar="A,B", convert=names_among(EVENTS)
+        tuple(EVENTS), f"among {', '.join(EVENTS)}", metavar="A,B", convert=one_or_more(EVENTS)
     )
     objects: tuple[str, ...] = option((), "of the task's region in the recording (default: no region)", metavar="A,B")
     robots: int = option(1, "2: a teammate maps the same place, and a server fuses both maps", low=1, high=2)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ from quality_results import CONDITIONS, PLAN, TASK, UNIFORM, finished
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import PoseExposurePrior
+from gausslite.mapping.policies import POLICIES
 from gausslite.nouns import same_kind
 from gausslite_bench.quality.growth import curves, growth_plot, growth_table
 from gausslite_bench.quality.home_scenes import HomeScenePlan
@@ -182,6 +184,15 @@ def test_a_curve_that_falls_is_named() -> None:
     assert "| 26.00 | 26.50 | 25.90 | **0.60** |" in table
     assert "1 of 2 curves fall by more than 0.1 dB in a step." in table
     assert growth_plot(list(steps), found).count("<polyline") == len(found)
+
+
+def test_each_policy_has_its_curve_and_colour() -> None:
+    budget = TrialBudget()
+    results = StudyResults([finished(Variant(name, name), 0, 20.0, budget) for name in POLICIES])
+    plot = growth_plot(["8"], curves([(results, budget)]))
+    colours = re.findall(r'<polyline.*stroke="(#\w+)"', plot)
+    assert len(set(colours)) == len(POLICIES) == 6
+    assert len(colours) == 2 * len(POLICIES)
 
 
 @pytest.mark.slow

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.state_file import write_atomic
-from gausslite.config.option import build, option
+from gausslite.config.option import build, option, options_of
+from gausslite.config.plain_values import require_plain
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES, TASK, UNIFORM
 from gausslite.mission.settings import MAX_RATE_HZ, MIN_RATE_HZ
@@ -17,6 +18,7 @@ from gausslite_bench.cli.study_options import (
     DEFAULT_HOME_FRAMES,
     DEFAULT_SIZE,
     StudyOptions,
+    one_or_more,
     real_sequence_plans,
     study_command,
     write_results,
@@ -56,23 +58,23 @@ class _BudgetOptions:
 class _QualityOptions:
     pairs: tuple[str, ...] = option((), f"{_PAIR_HELP} (default: all 24 pairs)", metavar="A,B")
     policies: tuple[str, ...] = option(
-        tuple(POLICIES), "policies; tables compare the first with the best other (default: all)", metavar="A,B"
+        tuple(POLICIES), "policies; margins are of the first (default: all)", metavar="A,B", convert=one_or_more()
     )
-    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...")
+    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...", convert=one_or_more())
     equal: str = option(str(BudgetMode.ITERATIONS), _EQUAL_HELP, choices=_EQUAL)
 
 
 @dataclass(frozen=True, slots=True)
 class _AblationOptions:
     pair: tuple[str, ...] = option((), f"{_PAIR_HELP} (default: {_ABLATION_TASK}, or none with --real)", metavar="A,B")
-    seeds: tuple[int, ...] = option((0, 1, 2), "mapping seeds", metavar="N,...")
+    seeds: tuple[int, ...] = option((0, 1, 2), "mapping seeds", metavar="N,...", convert=one_or_more())
     equal: str = option(_BOTH, _EQUAL_HELP, choices=_EQUAL)
 
 
-_FRAMES = "frames"
+_FRAMES, _RATE = "frames", "rate"
 _GROWTH_STEPS = {
     "iterations": ("4", "8", "16", "32", "64", "128"),
-    "rate": ("8", "4", "2", "1"),
+    _RATE: ("8", "4", "2", "1"),
     _FRAMES: ("15", "30", "60", "120"),
     "max-gaussians": ("10000", "30000", "100000", "300000"),
 }
@@ -82,18 +84,16 @@ _GROWTH_STEPS = {
 @dataclass(frozen=True, slots=True)
 class _GrowthOptions:
     quantity: str = option("iterations", "what grows; the other limits stay", choices=tuple(_GROWTH_STEPS))
-    steps: tuple[str, ...] = option((), "its values from the least to the most", metavar="N,...")
+    steps: tuple[str, ...] = option((), "its values from the least to the most", metavar="N,...", convert=one_or_more())
     pairs: tuple[str, ...] = option((), f"{_PAIR_HELP} (default: {_ABLATION_TASK}, or none with --real)", metavar="A,B")
-    policies: tuple[str, ...] = option((TASK, UNIFORM), "policies", metavar="A,B")
-    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...")
+    policies: tuple[str, ...] = option((TASK, UNIFORM), "policies", metavar="A,B", convert=one_or_more())
+    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...", convert=one_or_more())
     views: int = option(24, "held-out views per home", low=2)
 
 
 def run_quality(options: argparse.Namespace) -> int:
     """Compare policies and write quality.md and quality.json."""
     variants = [Variant(name, name) for name in options.policies]
-    if not variants:
-        raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
     return _report(options, _study(options, options.pairs, (), variants), "quality", quality_table)
 
 
@@ -110,6 +110,9 @@ def run_compute(options: argparse.Namespace) -> int:
     variants = [Variant(name, name) for name in chosen.policies]
     # wrong values fail here, before hours of work
     stepped = {step: _with_step(options, chosen.quantity, step) for step in steps}
+    values = [getattr(own, chosen.quantity.replace("-", "_")) for own in stepped.values()]
+    if values != sorted(set(values), reverse=chosen.quantity == _RATE):
+        raise InvalidInputError(f"steps: expected ascending values, descending rates, got {', '.join(steps)}")
     studies = {step: _study(own, chosen.pairs, (_ABLATION_TASK,), variants) for step, own in stepped.items()}
     budgets = [study.budgets[0] for study in studies.values()]
     if chosen.quantity == _FRAMES:
@@ -128,11 +131,13 @@ def run_compute(options: argparse.Namespace) -> int:
 def _with_step(options: argparse.Namespace, quantity: str, step: str) -> argparse.Namespace:
     """Return the options with another value of the quantity. Raises InvalidInputError."""
     try:
-        value = float(step) if quantity == "rate" else int(step)
+        value = float(step) if quantity == _RATE else int(step)
     except ValueError:
         raise InvalidInputError(f"steps: expected numbers such as {_GROWTH_STEPS[quantity][0]}, got {step!r}") from None
+    limits = options_of(_BudgetOptions if quantity == _RATE else StudyOptions)[quantity].option
+    require_plain("steps", value, type(value), limits.low, limits.high, unit="", choices=())
     name = quantity.replace("-", "_")
-    equal = BudgetMode.TIME if quantity == "rate" else BudgetMode.ITERATIONS
+    equal = BudgetMode.TIME if quantity == _RATE else BudgetMode.ITERATIONS
     others = {"rate": None, "lpips_weights": None, "equal": str(equal)}
     return argparse.Namespace(**{**vars(options), **others, name: value})
 

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.option import build, option
@@ -32,13 +33,15 @@ def read_image_size(text: str) -> tuple[int, int]:
     return sides[0], sides[1]
 
 
-def names_among(names: Collection[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
-    """Return what reads an option of several names: it raises InvalidInputError unless they are among these."""
+def one_or_more(allowed: Collection[str] = ()) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+    """Return what reads different values, one at least, of the allowed ones if any. It raises InvalidInputError."""
 
-    def read(given: tuple[str, ...]) -> tuple[str, ...]:
-        wrong = next((repr(name) for name in given if name not in names), None if given else "none")
-        if wrong is not None:
-            raise InvalidInputError(f"expected some of {', '.join(names)}, got {wrong}")
+    def read(given: tuple[Any, ...]) -> tuple[Any, ...]:
+        wrong = [repr(value) for value in given if allowed and value not in allowed]
+        wrong += [f"{value} twice" for value in given if given.count(value) > 1]
+        if wrong or not given:
+            expected = f"some of {', '.join(allowed)}" if allowed else "one value or more, each once"
+            raise InvalidInputError(f"expected {expected}, got {wrong[0] if wrong else 'none'}")
         return given
 
     return read

@@ -16,7 +16,7 @@ from gausslite_bench.cli.study_options import (
     DEFAULT_HOME_FRAMES,
     DEFAULT_SIZE,
     StudyOptions,
-    names_among,
+    one_or_more,
     real_sequence_plans,
     study_command,
     write_results,
@@ -31,15 +31,15 @@ from gausslite_bench.team.tables import team_table
 class TeamOptions:
     """The options of `bench team` beside those of all studies."""
 
-    homes: tuple[int, ...] = option((), "homes, 1 to 8 (default: 1, or none with --real)", metavar="N,...")
-    team_sizes: tuple[int, ...] = option((2,), "numbers of agents, 2 to 4", metavar="N,...")
+    homes: tuple[int, ...] = option((), "homes 1-8 (default: 1 without --real)", metavar="N,...", convert=one_or_more())
+    team_sizes: tuple[int, ...] = option((2,), "numbers of agents, 2 to 4", metavar="N,...", convert=one_or_more())
     policies: tuple[str, ...] = option(
         ("task", "uniform", "splatam", "monogs", "gaussian-slam"),
         "policies",
         metavar="A,B",
-        convert=names_among(POLICIES),
+        convert=one_or_more(POLICIES),
     )
-    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...")
+    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...", convert=one_or_more())
     views: int = option(16, "held-out views", low=1, high=10_000)
     refine_iterations: int = option(300, "joint refinement; 0: none", low=0)
 

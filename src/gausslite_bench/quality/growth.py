@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import pairwise, product
+from itertools import cycle, pairwise, product
 from statistics import fmean
 
 from gausslite_bench.quality.tables import FULL_PSNR, ROI_PSNR, StudyResults, markdown
@@ -13,7 +13,7 @@ from gausslite_bench.quality.trials import TrialBudget
 
 _TOLERATED_FALL_DB = 0.1
 _WIDTH, _HEIGHT, _MARGIN = 480.0, 200.0, 40.0
-_COLOURS = ("#2a78b8", "#d9822b", "#3a9d5d", "#b8475a")
+_COLOURS = ("#2a78b8", "#d9822b", "#3a9d5d", "#b8475a", "#7a55a8", "#6b6b6b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def _plot(top: float, steps: Sequence[str], plotted: Sequence[Curve]) -> Iterato
     low, span = min(values), max(max(values) - min(values), _TOLERATED_FALL_DB)
     xs = [_MARGIN + i * (_WIDTH - 2 * _MARGIN) / max(len(steps) - 1, 1) for i in range(len(steps))]
     bottom, height = top + _HEIGHT - _MARGIN, _HEIGHT - 2 * _MARGIN
-    yield f'<text x="{_MARGIN:g}" y="{top + 24:g}">{escape(f"{plotted[0].scene}, {plotted[0].metric}")}</text>'
+    yield f'<text x="{_MARGIN:g}" y="{top + 14:g}">{escape(f"{plotted[0].scene}, {plotted[0].metric}")}</text>'
     yield from (
         f'<text x="{x:.1f}" y="{bottom + 16:g}" text-anchor="middle">{escape(step)}</text>'
         for x, step in zip(xs, steps, strict=True)
@@ -84,9 +84,8 @@ def _plot(top: float, steps: Sequence[str], plotted: Sequence[Curve]) -> Iterato
     for share in (0.0, 1.0):
         place = f'x="{_MARGIN - 6:g}" y="{bottom - share * height:.1f}"'
         yield f'<text {place} text-anchor="end">{low + share * span:.1f}</text>'
-    for i, (colour, curve) in enumerate(zip(_COLOURS, plotted, strict=False)):
-        place = f'x="{_WIDTH - _MARGIN - 80 * i:g}" y="{top + 24:g}" fill="{colour}"'
-        yield f'<text {place} text-anchor="end">{escape(curve.policy)}</text>'
+    for i, (colour, curve) in enumerate(zip(cycle(_COLOURS), plotted, strict=False)):
+        yield f'<text x="{8 + 78 * i}" y="{top + 30:g}" fill="{colour}">{escape(curve.policy)}</text>'
         ys = [bottom - (value - low) / span * height for value in curve.psnr_db]
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(xs, ys, strict=True))
         yield f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2"/>'

@@ -83,8 +83,8 @@ class RealScenePlan:
             **files,
         }
 
-    def load(self, size: tuple[int, int]) -> Scene:
-        """Return the scene of the frames with depth. Raises UnseenRegionError, DatasetError, InvalidInputError."""
+    def load(self, size: tuple[int, int], is_part_of_team: bool = False) -> Scene:
+        """Return the scene. Raises UnseenRegionError unless part of a team, DatasetError, InvalidInputError."""
         source = open_source(str(self.folder), self.up_axis, self.depth_registration)
         if self.camera_correction is not None:
             source = CorrectedSource(source, self.camera_correction)
@@ -93,13 +93,19 @@ class RealScenePlan:
         training, held_out = self.split.split(self._positions(source))
         views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
         views = [view for view in views if not view.frame.defect]
-        if views and not any(view.shows_region for view in views):
-            raise UnseenRegionError(
-                f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "
-                f"{', '.join(self.objects)} at {size[0]}x{size[1]}, got none of {len(views)}"
-            )
+        if views and not is_part_of_team:
+            self.require_shown(views)
         info = SceneInfo(source.up_axis, all_regions)
         return make_scene(self.task, [source.frame(i, size) for i in training], views, regions, info)
+
+    def require_shown(self, views: Sequence[HeldOutView]) -> None:
+        """Raise UnseenRegionError unless one of the held-out views shows the objects."""
+        if not any(view.shows_region for view in views):
+            camera = views[0].frame.camera
+            raise UnseenRegionError(
+                f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "
+                f"{', '.join(self.objects)} at {camera.width_px}x{camera.height_px}, got none of {len(views)}"
+            )
 
     def _positions(self, source: Source) -> list[int]:
         if self.frames is None:

@@ -17,7 +17,7 @@ from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.limits import Quotas
 from gausslite.wire.clients import FusionClient
-from gausslite_bench.cli.study_options import names_among
+from gausslite_bench.cli.study_options import one_or_more
 from gausslite_bench.report import Report
 from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad
 from gausslite_bench.server.hostile import ATTACKS, measure_attack
@@ -45,7 +45,7 @@ class ServerBenchSettings:
         (),
         f"only measure good callers under these attacks, each on a new server: all, or some of {', '.join(ATTACKS)}",
         metavar="A,B",
-        convert=names_among(("all", *ATTACKS)),
+        convert=one_or_more(("all", *ATTACKS)),
     )
 
     def __post_init__(self) -> None:

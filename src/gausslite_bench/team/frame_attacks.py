@@ -22,7 +22,7 @@ from gausslite.fusion.frames import AlignmentState
 from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.render.rasterizer import MEAN, RGB
-from gausslite_bench.cli.study_options import names_among
+from gausslite_bench.cli.study_options import one_or_more
 from gausslite_bench.raster.room import SEED_VIEWS, seed_rows
 from gausslite_bench.report import Report
 from gausslite_places.frame_aligner import MapAligner
@@ -151,7 +151,7 @@ class FrameAttackSettings:
 
     runs: int = option(20, "runs of each attack, with the seeds 0, 1 and so on", low=1)
     attacks: tuple[str, ...] = option(
-        tuple(ATTACKS), f"among {', '.join(ATTACKS)}", metavar="A,B", convert=names_among(ATTACKS)
+        tuple(ATTACKS), f"among {', '.join(ATTACKS)}", metavar="A,B", convert=one_or_more(ATTACKS)
     )
 
 

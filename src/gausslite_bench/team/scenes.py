@@ -94,11 +94,13 @@ class RecordingTeamPlan:
         return self.kinds[0].pose_prior
 
     def load(self, size: tuple[int, int]) -> TeamScene:
-        """Return the scenes at (width_px, height_px). Raises DatasetError, InvalidInputError."""
+        """Return the scenes at (width_px, height_px). Raises UnseenRegionError, DatasetError, InvalidInputError."""
         chosen = [self.kinds[i % len(self.kinds)] for i in range(self.agents)]
         names = tuple(dict.fromkeys(name for plan in chosen for name in plan.objects))
-        scenes = [replace(plan, objects=names).load(size) for plan in self.recordings or self.kinds[:1]]
+        plans = [replace(plan, objects=names) for plan in self.recordings or self.kinds[:1]]
+        scenes = [plan.load(size, is_part_of_team=True) for plan in plans]
         info, held_out = scenes[0].info, [view for scene in scenes for view in scene.held_out]
+        plans[0].require_shown(held_out)
         parts = [scene.training for scene in scenes]
         if not self.recordings:
             count = len(parts[0])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from math import isnan, nan
 from statistics import fmean
 
 from gausslite_bench.quality.tables import markdown
@@ -32,9 +33,16 @@ def _rows(group: Sequence[TeamResult]) -> Iterator[list[str]]:
     )
     figures = f"{fmean(result.share_percent for result in group):.1f} %"
     messages = f"{gaussians:.0f}, {sent / 1e6:.2f} MB ({100 * sent / max(whole, 1):.1f} %)"
-    psnr = {name: fmean(result.scores[name].roi_psnr or 0.0 for result in group) for name in group[0].scores}
+    psnr = {name: _mean(result.scores[name].roi_psnr for result in group) for name in group[0].scores}
     for name, roi_psnr in psnr.items():
         scores = [result.scores[name] for result in group]
-        ssim, full = fmean(score.roi_ssim or 0.0 for score in scores), fmean(score.full_psnr for score in scores)
-        quality = f"{roi_psnr:.2f}", f"{roi_psnr - psnr[CONCATENATION]:+.2f}", f"{ssim:.3f}", f"{full:.2f}"
+        ssim, full = _mean(score.roi_ssim for score in scores), _mean(score.full_psnr for score in scores)
+        values = (roi_psnr, ".2f"), (roi_psnr - psnr[CONCATENATION], "+.2f"), (ssim, ".3f"), (full, ".2f")
+        quality = ("–" if isnan(value) else format(value, form) for value, form in values)
         yield [group[0].scene, group[0].policy, name, *quality, figures, messages, str(len(group))]
+
+
+def _mean(values: Iterable[float | None]) -> float:
+    """Return the mean of what was measured, NaN if nothing was."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else nan
