@@ -16,7 +16,7 @@ from gausslite.datasets.folder import FolderSource, Origin, is_lost
 from gausslite.datasets.pose_track import nearest_rigid
 from gausslite.datasets.source import excluded_frames_note, require_position
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import MAX_COORDINATE_M, Frame
 from gausslite.domain.pose import Trajectory
 
 _RATE_HZ = 30
@@ -93,7 +93,11 @@ class NumberedFolderSource(FolderSource):
     def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
         if not self._require_poses and not self._has_pose(number):
             return np.eye(4)
-        return self._origin.moved(nearest_rigid(self._pose_location(number), self._read_matrix(number)))
+        location = self._pose_location(number)
+        T = self._origin.moved(nearest_rigid(location, self._read_matrix(number)))
+        if (distance_m := np.abs(T[:3, 3]).max()) > MAX_COORDINATE_M:
+            raise PoseError(f"{location}: expected a camera within 10 km of the map's origin, got {distance_m:g} m")
+        return T
 
     def _has_pose(self, number: int) -> bool:
         try:

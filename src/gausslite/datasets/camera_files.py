@@ -41,7 +41,7 @@ def example_camera_file(width_px: int, height_px: int) -> str:
 
 def find_in_or_above(folder: Path, name: str) -> Path | None:
     """Return the file of this name in the folder or in its parent, or None."""
-    return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
+    return next((path for path in (folder / name, folder.absolute().parent / name) if path.is_file()), None)
 
 
 @dataclass(frozen=True, slots=True)

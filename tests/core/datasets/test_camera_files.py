@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_sequences import HEIGHT, WIDTH, write_colour, write_seven_scenes, write_tum
+from tiny_sequences import HEIGHT, WIDTH, write_colour, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.camera_files import lens_of, read_folder_camera
 from gausslite.datasets.open import open_source
@@ -103,6 +103,11 @@ def test_a_camera_file_one_folder_above_is_named(
     write_json(folder / "cam_params.json", fx=22.0)
     assert open_recorded(str(folder), (0.0, -1.0, 0.0)).camera.fx_px == 22.0
     assert capsys.readouterr().err == ""
+
+
+def test_the_camera_file_above_is_found_from_inside_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(write_replica(tmp_path / "office"))
+    assert open_source(".").camera.fx_px == 20.0
 
 
 def test_a_camera_file_above_for_images_of_another_size_is_not_used(tmp_path: Path) -> None:

@@ -129,6 +129,7 @@ CASES: list[tuple[str, Damage, str]] = [
     ("replica", lambda f: replace(f.parent / "cam_params.json", '"w": 16', '"w": 20'), "size 20x12"),
     ("replica", lambda f: [p.unlink() for p in f.glob("results/*")], "results: expected images named"),
 ]
+HERE, FAR = (f"1 0 0 {x} 0 1 0 0 0 0 1 0 0 0 0 1\n" for x in ("0", "{}"))
 POSES: list[tuple[str, Damage, str]] = [
     (
         "tum",
@@ -146,6 +147,8 @@ POSES: list[tuple[str, Damage, str]] = [
     ("seven", lambda f: replace(f / SEVEN_POSE, "0 1 0 0", "0 -1 0 0"), f"{SEVEN_POSE}: expected a rigid"),
     ("seven", lambda f: replace(f / SEVEN_POSE, "0 0 0 1", "0 0 1 1"), f"{SEVEN_POSE}: expected a last row"),
     ("replica", text("traj.txt", ("nan " + "1 " * 15 + "\n") * 3), "line 1: .* nan"),
+    ("replica", text("traj.txt", f"{HERE}{HERE}{FAR.format('1e8')}"), "traj.txt line 3: .* within 10 km .* got 1e"),
+    ("replica", text("traj.txt", f"{HERE}{FAR.format('1e300')}{HERE}"), "traj.txt line 2: .* within 10 km .* got 1e"),
 ]
 
 
