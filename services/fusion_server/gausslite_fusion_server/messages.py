@@ -67,6 +67,8 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     """Store a keyframe as it was received. Raises InvalidInputError, QuotaError, SessionUnknownError."""
     agent_id = session_of(engine, request.session_id, caller).agent_id
     message = request.keyframe
+    if not request.HasField("keyframe"):
+        raise InvalidInputError("keyframe: expected one, got none")
     # before any image is decoded: its header must then state the camera's size
     pixels = message.camera.width_px * message.camera.height_px
     engine.settings.quotas.require_keyframe(message.index, pixels, message.ByteSize())

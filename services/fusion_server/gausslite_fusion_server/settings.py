@@ -146,7 +146,8 @@ def build_parser() -> CommandParser:
     parser = CommandParser(
         prog=PROGRAM,
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
-        "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
+        "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins, or one "
+        "whose error in the agents' keyframes is less than half as large.",
         epilog=f"Commands that maintain the file of a store: {', '.join(names(Group.SERVER_COMMANDS))}. "
         f"`{PROGRAM} COMMAND --help` describes each.",
     )

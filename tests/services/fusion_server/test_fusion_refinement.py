@@ -29,6 +29,8 @@ def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
         assert status.keyframes == status.agents[0].keyframes == 2
         broken = pb.ContributeKeyframesRequest(session_id=session)
         broken.keyframe.index = 77
+        answer = t.stub.ContributeKeyframes(iter([pb.ContributeKeyframesRequest(session_id=session, selected=[3])]))
+        assert (answer.accepted, answer.rejected[0].reason) == (0, "keyframe: expected one, got none")
         answer = t.stub.ContributeKeyframes(iter([broken]))
         assert answer.accepted == 0
         assert answer.rejected[0].index == 77
