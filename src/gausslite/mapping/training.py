@@ -40,8 +40,7 @@ _HALF_SIZE_VIEWS = 4
 _LOADED_UPDATES = 2000
 """Updates that a Gaussian of another map counts as. A second walk through half of sim:home takes from the views of the
 first one 3.0 dB with 0, 1.9 with 150, 1.3 with 2000, and 0.9 with 20 000, which costs its own views 0.6 dB."""
-_Rows: TypeAlias = Float32[ndarray, "n 16"]
-_Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
+_Tables: TypeAlias = tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]]
 
 
 class RegionSaturation:

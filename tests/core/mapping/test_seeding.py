@@ -137,9 +137,7 @@ def test_a_region_is_undersampled_without_enough_active_gaussians_on_its_surface
 
 def test_background_that_becomes_the_region_is_seeded() -> None:
     frame = wall_frame()
-    state = SeedingContext(
-        1_000_000, rendering_of(np.ones((48, 64)), frame.depth_m), NO_MEANS
-    )
+    state = SeedingContext(1_000_000, rendering_of(np.ones((48, 64)), frame.depth_m), NO_MEANS)
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
     assert len(seeds.background) == 0
