@@ -82,7 +82,8 @@ def _residuals(
         difference = np.clip(rendering.rgb, 0.0, 1.0) - frame.rgb / np.float32(255.0)
         # the gradient of a Gaussian's colour is the sum of its weights
         d_rgb, none = np.zeros_like(rendering.rgb), np.zeros_like(rendering.depth_m)
-        d_rgb[..., 0], d_rgb[..., 1] = 1.0, np.square(difference).mean(axis=2)
+        counted = 1.0 if frame.left_out is None else ~frame.left_out
+        d_rgb[..., 0], d_rgb[..., 1] = counted, np.square(difference).mean(axis=2) * counted
         sums += rasterizer.backward(rendering, d_rgb, none, none).d_rows[:, RGB].T[:2]
     return np.add.reduceat(sums, np.cumsum(shown.counts, dtype=np.int64) - shown.counts, axis=1)
 
@@ -90,6 +91,9 @@ def _residuals(
 def reduced(frame: Frame) -> tuple[Frame, float]:
     """Return a small frame without depth, and the dilation in px² with which it is rendered."""
     camera = frame.camera.narrower(_WIDTH_PX)
-    rgb = cv2.resize(frame.rgb, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
-    small = replace(frame, rgb=rgb, depth_m=np.zeros(rgb.shape[:2], np.float32), camera=camera)
+    size = camera.width_px, camera.height_px
+    rgb, left_out = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), None
+    if frame.left_out is not None:
+        left_out = cv2.resize(frame.left_out.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+    small = replace(frame, rgb=rgb, depth_m=np.zeros(rgb.shape[:2], np.float32), camera=camera, left_out=left_out)
     return small, reduced_dilation_px2(frame.camera.width_px / camera.width_px)
