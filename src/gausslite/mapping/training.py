@@ -39,7 +39,7 @@ _COLOUR_RANGE = (-0.25, 1.25)
 _HALF_SIZE_VIEWS = 4
 _LOADED_UPDATES = 2000
 """Updates that a Gaussian of another map counts as. A second walk through half of sim:home takes from the views of the
-first one 3.0 dB with 0, 1.9 with 150, 1.3 with 2000, and 0.9 with 20 000, which costs its own views 0.6 dB."""
+first one 3.0 dB with 0, 1.7 with 150, 1.1 with 2000, and 0.6 with 20 000, which costs its own views 0.5 dB."""
 _Tables: TypeAlias = tuple[Float32[ndarray, "n 16"], Float32[ndarray, "n 16"], Float32[ndarray, "n 16"]]
 
 
